@@ -51,14 +51,20 @@ class PlainConsole(Console):
 
     def render_str(self, text: str, **options: Any) -> Text:
         """See `rich.console.Console.render_str`; all strings come by here, those of tables too."""
-        return super().render_str(printable(text), **(options | {"markup": False, "emoji": False, "highlight": False}))
+        literally = {"markup": False, "emoji": False, "highlight": False}
+        return super().render_str(printable(text), **(options | literally))
 
 
 def styled(*parts: str | tuple[str, str]) -> Text:
     """Join texts, each plain or with a style."""
-    return Text.assemble(
-        *(printable(part) if isinstance(part, str) else (printable(part[0]), part[1]) for part in parts)
-    )
+    line = Text()
+    for part in parts:
+        if isinstance(part, str):
+            line.append(printable(part))
+        else:
+            text, style = part
+            line.append(printable(text), style)
+    return line
 
 
 def stdout() -> PlainConsole:
@@ -76,24 +82,33 @@ def stderr() -> PlainConsole:
 
 def show(parts: Iterable[RenderableType], console: PlainConsole | None = None) -> None:
     """Print sentences, wrapped at spaces, and tables; messages on a stderr that is no terminal have one line each."""
-    console = stdout() if console is None else console
+    if console is None:
+        console = stdout()
     on_one_line = console.stderr and not console.is_terminal
     for part in parts:
-        if isinstance(part, str | Text) and not on_one_line:
-            part = _wrapped(styled(part) if isinstance(part, str) else part, console.width)
-        console.print(part, soft_wrap=isinstance(part, str | Text), crop=False)
+        if not isinstance(part, str | Text):
+            console.print(part, crop=False)
+            continue
+        sentence = part
+        if not on_one_line:
+            sentence = _wrapped(part, console.width)
+        console.print(sentence, soft_wrap=True, crop=False)
 
 
-def _wrapped(text: Text, width: int) -> Text:
+def _wrapped(sentence: str | Text, width: int) -> Text:
     """Break lines at spaces; a word that is longer than a line, such as a path, stays whole."""
-    if text.no_wrap:
-        return text
+    if isinstance(sentence, str):
+        sentence = styled(sentence)
+    if sentence.no_wrap:
+        return sentence
     lines: list[Text] = []
-    for line in text.split(allow_blank=True):
+    for line in sentence.split(allow_blank=True):
         starts = [0]
         plain = line.plain
         for word in re.finditer(r"\S+", plain):
-            if plain[starts[-1] : word.start()].strip() and cell_len(plain[starts[-1] : word.end()]) > width:
+            before = plain[starts[-1] : word.start()]
+            with_word = plain[starts[-1] : word.end()]
+            if before.strip() and cell_len(with_word) > width:
                 starts.append(word.start())
         lines += line.divide(starts[1:])
     for line in lines:
@@ -103,16 +118,19 @@ def _wrapped(text: Text, width: int) -> Text:
 
 def to_text(parts: Iterable[RenderableType]) -> str:
     """Return sentences and tables as text without colours."""
-    console = PlainConsole(width=CONSOLE_WIDTH, file=io.StringIO())
-    show(parts, console)
-    return console.export_text()
+    return _recorded(parts).export_text()
 
 
 def to_html(parts: Iterable[RenderableType]) -> str:
     """Return sentences and tables as HTML for a notebook."""
+    return _recorded(parts).export_html(inline_styles=True, code_format=_HTML)
+
+
+def _recorded(parts: Iterable[RenderableType]) -> PlainConsole:
+    """Return a console that no one sees, with sentences and tables on it."""
     console = PlainConsole(width=CONSOLE_WIDTH, file=io.StringIO())
     show(parts, console)
-    return console.export_html(inline_styles=True, code_format=_HTML)
+    return console
 
 
 def say(text: str) -> None:
@@ -167,12 +185,15 @@ def table(
     table.caption_justify = "left"
     table.spare = spare
     for i, name in enumerate(head):
-        justify: JustifyMethod
-        if i and name not in left:
-            justify = "right"
-        else:
+        is_first = i == 0
+        justify: JustifyMethod = "right"
+        if is_first or name in left:
             justify = "left"
-        table.add_column(name, justify=justify, overflow="fold", no_wrap=bool(i) if spare else not i)
+        if spare:
+            wraps = is_first
+        else:
+            wraps = not is_first
+        table.add_column(name, justify=justify, overflow="fold", no_wrap=not wraps)
     for line in lines:
         table.add_row(*line)
     return table
@@ -186,8 +207,9 @@ class _SparingTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """See `rich.table.Table`."""
         shown = copy(self)
+        unbounded = options.update(width=_UNBOUNDED)
         for name in self.spare:
-            if Measurement.get(console, options.update(width=_UNBOUNDED), shown).maximum <= options.max_width:
+            if Measurement.get(console, unbounded, shown).maximum <= options.max_width:
                 break
             shown.columns = [column for column in shown.columns if column.header != name]
         yield from Table.__rich_console__(shown, console, options)
@@ -203,8 +225,9 @@ def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[Rend
     for grid in grids:
         lines = []
         for line in grid.lines:
-            lines.append([styled_cell(value) for value in line])
-        yield table(grid.title, grid.head, lines, caption=grid.note.replace("`", "") or None, left=left)
+            lines.append([styled_cell(cell) for cell in line])
+        caption = grid.note.replace("`", "") or None
+        yield table(grid.title, grid.head, lines, caption=caption, left=left)
         yield ""
 
 
@@ -225,18 +248,24 @@ class _Entries:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """See `rich.console.Console`."""
         yield styled((self._title, "bold"))
-        if not options.is_terminal:
-            width = max(map(cell_len, self._entries), default=0)
-            for name, line in self._entries.items():
-                padding = " " * (width - cell_len(name))
-                whole = styled("  ", (name, "cyan"), f"{padding}  {line}")
-                whole.no_wrap = True
-                whole.overflow = "ignore"
-                yield whole
-            return
+        if options.is_terminal:
+            yield self._table()
+        else:
+            yield from self._whole_lines()
+
+    def _table(self) -> Table:
         table = Table(box=None, show_header=False, padding=(0, 2))
         table.add_column(no_wrap=True, style="cyan")
         table.add_column()
         for name, line in self._entries.items():
             table.add_row(name, line)
-        yield table
+        return table
+
+    def _whole_lines(self) -> Iterator[Text]:
+        width = max(map(cell_len, self._entries), default=0)
+        for name, line in self._entries.items():
+            padding = " " * (width - cell_len(name))
+            whole = styled("  ", (name, "cyan"), f"{padding}  {line}")
+            whole.no_wrap = True
+            whole.overflow = "ignore"
+            yield whole

@@ -65,8 +65,8 @@ def flight_verdicts(flight: FlightRecord) -> tuple[str, Cases]:
     """
     text = "; ".join([flight.reason or "completed", *failure_sentences(flight)])
     failed = flight.numbers["controller"].get("unrecovered") or failed_takeoff(flight)
-    whole = flight.reason is None and not failed
-    cases = [("flight", whole, text), *map(_case, flight.findings)]
+    passed = flight.reason is None and not failed
+    cases = [("flight", passed, text), *map(_case, flight.findings)]
     if not flight.findings:
         cases.append(("audit", False, "; ".join(flight.numbers["audit_notes"])))
     return flight.name, cases
@@ -79,14 +79,22 @@ def write_cases(suite: str, cases: Cases, path: Path) -> Path:
     """
     name = printable(f"quadsim.{suite}")
     results = [passed for _, passed, _ in cases]
-    counts = {"tests": len(cases), "failures": results.count(False), "skipped": results.count(None)}
-    root = ElementTree.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
+    root = ElementTree.Element(
+        "testsuite",
+        name=name,
+        tests=str(len(cases)),
+        failures=str(results.count(False)),
+        skipped=str(results.count(None)),
+    )
     for case_name, passed, sentence in cases:
         case = ElementTree.SubElement(root, "testcase", classname=name, name=printable(case_name))
-        if passed:
-            ElementTree.SubElement(case, "system-out").text = printable(sentence)
+        message = printable(sentence)
+        if passed is None:
+            ElementTree.SubElement(case, "skipped", message=message)
+        elif passed:
+            ElementTree.SubElement(case, "system-out").text = message
         else:
-            ElementTree.SubElement(case, "skipped" if passed is None else "failure", message=printable(sentence))
+            ElementTree.SubElement(case, "failure", message=message)
     with writing_file(junit_file(path), overwrite=True) as file:
         file.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
     return path
@@ -97,10 +105,13 @@ def _case(finding: Finding) -> tuple[str, bool | None, str]:
     limit = finding.limit
     if finding.verdict == "incomplete":
         text = "not reached: the flight has no value in the constraint's time window"
-        return limit.name, None if limit.required else True, text
+        if limit.required:
+            return limit.name, None, text
+        return limit.name, True, text
     text = (
         f"worst margin {format_number(finding.worst_margin)} {limit.unit} at t = {finding.worst_time:.3f} s "
         f"(tolerance {limit.tolerances[0]:g}), {format_number(finding.worst_margin_sampled)} at the samples "
         f"(tolerance {limit.tolerances[1]:g}); violated for {finding.time_violated:.3f} s"
     )
-    return limit.name, finding.satisfied or not limit.required, text
+    passes = finding.satisfied or not limit.required
+    return limit.name, passes, text

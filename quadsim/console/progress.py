@@ -28,8 +28,7 @@ def reporting(progress: Progress | bool, what: str, *, bars: bool = True) -> Ite
     """Yield the function that reports progress: a bar per stage on a terminal, elsewhere a line every `LINE_EVERY`.
 
     `what` is what starts, until the first stage is reported, e.g. `the flight`.  False reports nothing; a function
-    replaces both.  Without `bars` a terminal has the lines too, which take no time
-    from what is being timed.
+    replaces both.  Without `bars` a terminal has the lines too, which take no time from what is being timed.
     """
     if callable(progress):
         yield progress
@@ -39,10 +38,25 @@ def reporting(progress: Progress | bool, what: str, *, bars: bool = True) -> Ite
     if not progress:
         yield silent
         return
-    if not (screen := stderr()).is_terminal or not bars:
-        with lines(screen, f"starting {what}") as tell:
-            yield lambda stage, done, total: tell(f"{stage} {100 * done // total} %" if total > 1 else stage)
+    screen = stderr()
+    if bars and screen.is_terminal:
+        with _bars(screen) as report_bar:
+            yield report_bar
         return
+    with lines(screen, f"starting {what}") as tell:
+
+        def report_line(stage: str, done: int, total: int) -> None:
+            if total > 1:
+                tell(f"{stage} {100 * done // total} %")
+            else:
+                tell(stage)
+
+        yield report_line
+
+
+@contextlib.contextmanager
+def _bars(screen: PlainConsole) -> Iterator[Progress]:
+    """Yield the function that moves a bar per stage, which pulses until a total is known or something is done."""
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
@@ -53,7 +67,10 @@ def reporting(progress: Progress | bool, what: str, *, bars: bool = True) -> Ite
         def report(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = stages.add_task(stage)
-            stages.update(tasks[stage], completed=done, total=total if total > 1 or done else None)  # None: it pulses
+            if total > 1 or done:
+                stages.update(tasks[stage], completed=done, total=total)
+            else:
+                stages.update(tasks[stage], completed=done, total=None)
 
         yield report
 

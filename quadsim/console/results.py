@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, failure_line
 
@@ -22,6 +22,7 @@ Shown: TypeAlias = "Iterable[RenderableType]"
 EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
+_MOST_LINES: Final = 9  # of the text of a result that `repr` shows
 
 
 class Result:
@@ -48,18 +49,20 @@ class Result:
         """Print the result."""
         from quadsim.console import console
 
-        console.show([*self.shown(), *self.outputs()])
+        console.show(self._parts())
 
     def text(self) -> str:
         """Return the output of `show` without colours."""
         from quadsim.console import console
 
-        return console.to_text([*self.shown(), *self.outputs()])
+        return console.to_text(self._parts())
 
     def __repr__(self) -> str:
         """Return the first lines of its text."""
         lines = [line.rstrip() for line in self.text().splitlines()]
-        return "\n".join([*lines[:9], *(["..."] if len(lines) > 9 else [])])
+        if len(lines) > _MOST_LINES:
+            lines = [*lines[:_MOST_LINES], "..."]
+        return "\n".join(lines)
 
     def small_plot(self) -> Figure | None:
         """Return a small plot for notebooks, or None."""
@@ -69,7 +72,10 @@ class Result:
         """Return its tables and its plot for a notebook."""
         from quadsim.console import console
 
-        return console.to_html([*self.shown(), *self.outputs()]) + plot_html(self.small_plot())
+        return console.to_html(self._parts()) + plot_html(self.small_plot())
+
+    def _parts(self) -> Shown:
+        return [*self.shown(), *self.outputs()]
 
 
 class Tabular(Result):
@@ -102,12 +108,12 @@ def require_pandas() -> None:
 
 
 def plot_html(figure: Figure | None) -> str:
-    """Return a plot for a notebook, or a line where it cannot be drawn."""
+    """Return a plot for a notebook, or a line where it cannot be drawn; nothing without one."""
+    if figure is None:
+        return ""
     from quadsim.report.to_matplotlib import figure_html
 
     try:
-        if figure is None:
-            return ""
         return figure_html(figure)
     except Exception as error:
         return f"<p>the plot {escape(failure_line(error))}</p>"
@@ -169,7 +175,8 @@ class Listing(dict[str, Mapping[str, str]], Tabular):
         """See `Tabular.records`."""
         rows = []
         for section, entries in self.items():
-            rows += [{"section": section, "name": name, "line": line} for name, line in entries.items()]
+            for name, line in entries.items():
+                rows.append({"section": section, "name": name, "line": line})
         return rows
 
     def shown(self) -> Shown:

@@ -15,7 +15,7 @@ from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import VERDICT_TEXT, Finding
 from quadsim.flight.record import FlightRecord
 from quadsim.mpc.laws import law_name
-from quadsim.report.comparison_rows import NOT_REQUIRED, required, rounded_margin, tracking_values
+from quadsim.report.comparison_rows import NOT_REQUIRED, required, rounded_margin, tracking_values, verdict_mark
 from quadsim.report.flight_sentences import (
     crash,
     departing,
@@ -24,9 +24,9 @@ from quadsim.report.flight_sentences import (
     violated_otherwise,
     violated_unrequired,
 )
-from quadsim.report.table import ABSENT, short_number
+from quadsim.report.table import ABSENT, Cell, short_number
 
-_NAMED: Final = 3  # violated constraints named in the first line
+_MOST_NAMED: Final = 3  # violated constraints named in the first line
 _SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narrow console does without, in this order
 
 
@@ -74,34 +74,37 @@ def outcome_line(flight: FlightRecord) -> Text:
         colour = "red"
     if flight.reason is not None:
         return console.styled((f"{verdict}{remark}", colour), f": {flight.reason}")
-    line = _judged(flight, colour, remark)
-    if sentence := departing(flight):
-        line += console.styled("; ", (sentence, "yellow"))
-    return line
-
-
-def _judged(flight: FlightRecord, colour: str, remark: str) -> Text:
-    """Return the verdict on the required constraints of a flight that was flown to its end."""
-    verdict = flight.outcome
     if verdict in ("incomplete", "unaudited"):
-        if remark and flight.numbers.get("as_expected", True):
-            colour = "green"
-        else:
+        if not (remark and as_expected):
             colour = "yellow"
-        if verdict == "incomplete":
-            what = required(flight).text
-        else:
-            what = "no constraint was audited"
-        return console.styled((f"{verdict}, {what}{remark}", colour))
-    if verdict == "satisfied":
-        phrase = "every required constraint holds"
+        line = console.styled((f"{verdict}, {_missing(flight)}{remark}", colour))
     else:
-        phrase = _violations(flight.findings)
-    phrase = violated_otherwise(flight) or phrase
-    line = console.styled((f"{crash(flight) or 'completed'}, {phrase}{remark}", colour))
-    if violated := violated_unrequired(flight.findings):
-        line += console.styled("; ", (f"{NOT_REQUIRED}: {', '.join(violated)}", "yellow"))
+        line = console.styled((f"{_judged(flight)}{remark}", colour))
+        violated = violated_unrequired(flight.findings)
+        if violated:
+            line += console.styled("; ", (f"{NOT_REQUIRED}: {', '.join(violated)}", "yellow"))
+    leaving = departing(flight)
+    if leaving:
+        line += console.styled("; ", (leaving, "yellow"))
     return line
+
+
+def _missing(flight: FlightRecord) -> str:
+    """Return why there is no verdict on the required constraints."""
+    if flight.outcome == "incomplete":
+        return required(flight).text
+    return "no constraint was audited"
+
+
+def _judged(flight: FlightRecord) -> str:
+    """Return the verdict on the required constraints of a flight that was flown to its end."""
+    end = crash(flight) or "completed"
+    otherwise = violated_otherwise(flight)
+    if otherwise:
+        return f"{end}, {otherwise}"
+    if flight.outcome == "satisfied":
+        return f"{end}, every required constraint holds"
+    return f"{end}, {_violations(flight.findings)}"
 
 
 def _violations(findings: Sequence[Finding]) -> str:
@@ -109,121 +112,141 @@ def _violations(findings: Sequence[Finding]) -> str:
     violated = []
     for finding in findings:
         if finding.limit.required and finding.verdict == "violated":
-            margin, _ = finding.deciding
-            by = ""
-            if math.isfinite(margin):
-                if margin == finding.worst_margin:
-                    when = f"{finding.worst_time:.2f} s"
-                else:
-                    when = "the samples"
-                by = f" by {short_number(-margin)} {finding.limit.unit} at {when}"
-            violated.append(f"{finding.limit.name}{by}")
-    if len(violated) > _NAMED:
-        more = f" and {len(violated) - _NAMED} more"
+            violated.append(f"{finding.limit.name}{_largest_violation(finding)}")
+    if not violated:
+        return "a required constraint is violated"
+    named = ", ".join(violated[:_MOST_NAMED])
+    if len(violated) > _MOST_NAMED:
+        named += f" and {len(violated) - _MOST_NAMED} more"
+    return f"a required constraint is violated: {named}"
+
+
+def _largest_violation(finding: Finding) -> str:
+    """Return by how much a constraint is violated at most, and when; empty where that is not a number."""
+    margin, _ = finding.deciding
+    if not math.isfinite(margin):
+        return ""
+    if margin == finding.worst_margin:
+        when = f"{finding.worst_time:.2f} s"
     else:
-        more = ""
-    return ": ".join(filter(None, ["a required constraint is violated", ", ".join(violated[:_NAMED]) + more]))
+        when = "the samples"
+    return f" by {short_number(-margin)} {finding.limit.unit} at {when}"
 
 
 def audit_table(findings: Sequence[Finding]) -> Table:
     """Return every constraint with its bounds, peaks, smallest margin, tolerances and verdict."""
-    margins = [rounded_margin(finding.margin, finding.limit.tolerances[0]) for finding in findings]
     head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "at samples", "beyond", "verdict")
-    lines = []
-    for finding, margin in zip(findings, margins, strict=True):
-        at_physics, at_samples = finding.limit.tolerances
-        lines.append(
-            (
-                f"{finding.limit.name} [{finding.limit.unit}]",
-                _range(finding.limit.lower, finding.limit.upper),
-                *(short_number(peak, finding.limit.unit) for peak in (finding.peak_sampled, finding.peak_plant)),
-                short_number(margin),
-                ABSENT if finding.limit.source.plant is None else f"{at_physics:.3g}",
-                f"{at_samples:.3g}",
-                short_number(finding.time_violated),
-                _verdict(finding),
-            )
-        )
-    occurring = {
-        "margin: the smallest, negative = beyond the bound": any(margin < 0.0 for margin in margins),
-        "tolerance: at the physics rate, and at the samples": any(
-            finding.limit.source.plant is not None for finding in findings
-        ),
-        "beyond: time outside bound and tolerance [s]": any(finding.time_violated for finding in findings),
-        "-: no value": any(ABSENT in line for line in lines),
-        "*: reported, not required": bool(violated_unrequired(findings)),
-    }
-    caption = "; ".join(text for text, occurs in occurring.items() if occurs) or None
+    lines = [_audit_line(finding) for finding in findings]
+    caption = "; ".join(_audit_legend(findings, lines)) or None
     return console.table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), spare=_SPARE)
+
+
+def _audit_line(finding: Finding) -> tuple[str | Text, ...]:
+    limit = finding.limit
+    at_physics, at_samples = limit.tolerances
+    tolerance = ABSENT
+    if limit.source.plant is not None:
+        tolerance = f"{at_physics:.3g}"
+    return (
+        f"{limit.name} [{limit.unit}]",
+        _range(limit.lower, limit.upper),
+        short_number(finding.peak_sampled, limit.unit),
+        short_number(finding.peak_plant, limit.unit),
+        short_number(_shown_margin(finding)),
+        tolerance,
+        f"{at_samples:.3g}",
+        short_number(finding.time_violated),
+        _verdict(finding),
+    )
+
+
+def _shown_margin(finding: Finding) -> float:
+    at_physics, _ = finding.limit.tolerances
+    return rounded_margin(finding.margin, at_physics)
+
+
+def _audit_legend(findings: Sequence[Finding], lines: Sequence[tuple[str | Text, ...]]) -> Iterator[str]:
+    """Explain of an audit's columns and signs those that occur."""
+    if any(_shown_margin(finding) < 0.0 for finding in findings):
+        yield "margin: the smallest, negative = beyond the bound"
+    if any(finding.limit.source.plant is not None for finding in findings):
+        yield "tolerance: at the physics rate, and at the samples"
+    if any(finding.time_violated for finding in findings):
+        yield "beyond: time outside bound and tolerance [s]"
+    if any(ABSENT in line for line in lines):
+        yield "-: no value"
+    if violated_unrequired(findings):
+        yield "*: reported, not required"
 
 
 def _verdict(finding: Finding) -> Text:
     text = VERDICT_TEXT[finding.verdict]
-    if finding.verdict == "violated":
-        return console.styled((text, "red") if finding.limit.required else (f"{text}*", "yellow"))
-    return console.styled((text, "green" if finding.verdict == "satisfied" else "yellow"))
+    if finding.verdict == "violated" and not finding.limit.required:
+        text += "*"
+    return console.styled_cell(Cell(text=text, mark=verdict_mark(finding)))
 
 
 def _tracking_table(flight: FlightRecord) -> Table:
-    channels = [*flight.numbers["tracking"]["unit"]]
-    lines = []
-    for measure in ("rmse", "max_error", "final_error", "overshoot"):
-        columns = [tracking_values([flight], measure, channel) for channel in channels]
-        head = ["", *(f"{channel} [{unit}]" for channel, (unit, _) in zip(channels, columns, strict=True))]
-        numbers = (math.nan if value is None else value for _, (value,) in columns)
-        cells = (short_number(number, unit) for number, (unit, _) in zip(numbers, columns, strict=True))
-        lines.append((measure.replace("_", " ").replace("rmse", "RMS error"), *cells))
-    return console.table("tracking, real minus filtered reference", head, lines)
+    labels = {
+        "rmse": "RMS error",
+        "max_error": "max error",
+        "final_error": "final error",
+        "overshoot": "overshoot",
+    }
+    head = [""]
+    lines = {measure: [label] for measure, label in labels.items()}
+    for channel in flight.numbers["tracking"]["unit"]:
+        unit, _ = tracking_values([flight], "rmse", channel)
+        head.append(f"{channel} [{unit}]")
+        for measure, line in lines.items():
+            _, (value,) = tracking_values([flight], measure, channel)
+            if value is None:
+                line.append(ABSENT)
+            else:
+                line.append(short_number(value, unit))
+    return console.table("tracking, real minus filtered reference", head, lines.values())
 
 
 def _controller_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
-    control = numbers["control"]
+    """Yield who answered, how long the controller took, and what it commanded."""
     controller = numbers["controller"]
-    times = controller["step_ms"]
-    usual = OPTIMAL | {Phase.LANDED, Phase.CRASHED}
-    refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
+    law = law_name(controller["name"])
     if controller["solver"].startswith("C99"):
-        where = f" ({controller['solver']})"
-    else:
-        where = ""
-    yield (
-        f"{law_name(controller['name'])}{where}: {counts(controller['answered_by'])}"
-        f"{f' ({refused})' if refused else ''}"
-    )
+        law += f" ({controller['solver']})"
+    answers = counts(controller["answered_by"])
+    failures = []
+    for status, count in controller["statuses"].items():
+        if status not in OPTIMAL | {Phase.LANDED, Phase.CRASHED}:
+            failures.append(f"{count} {status}")
+    if failures:
+        answers += f" ({', '.join(failures)})"
+    yield f"{law}: {answers}"
+    times = controller["step_ms"]
     yield (
         f"whole step: median {times['p50']:.3g}, p99 {times['p99']:.3g}, max {times['max']:.3g} ms, "
         f"deadline {controller['deadline_ms']:g} ms"
     )
-    speeds, steps = (
-        " .. ".join(short_number(control[f"{what}_{end}"], "rad/s") for end in ("min", "max"))
-        for what in ("speed", "slew")
-    )
+    control = numbers["control"]
+    speeds = _span(control["speed_min"], control["speed_max"])
+    steps = _span(control["slew_min"], control["slew_max"])
     yield (
         f"commanded speeds {speeds} rad/s, steps {steps} rad/s per period; "
         f"simulated in {numbers['wall_s']['simulate']:.2f} s"
     )
 
 
+def _span(lowest: float, highest: float) -> str:
+    """Return two rotor speeds [rad/s] as a range."""
+    return f"{short_number(lowest, 'rad/s')} .. {short_number(highest, 'rad/s')}"
+
+
 def _effect_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
     """Yield the effects of a flight, if any: events, ground, late commands, errors of the estimate."""
-    if events := numbers.get("events"):
+    events = numbers.get("events")
+    if events:
         yield f"events: {'; '.join(event_sentences(events))}"
     if "ground" in numbers:
-        ground = numbers["ground"]
-        if ground["started"] == "flying":
-            left = "started in the air"
-        else:
-            left = "never left it"
-        if ground["takeoff_time"] is not None:
-            left = f"left it at {ground['takeoff_time']:.2f} s"
-        touch = ground["touchdown"]
-        met = ""
-        if touch is not None:
-            met = (
-                f", met it at {touch['time']:.2f} s with {touch['speed']:.3g} m/s down, "
-                f"{touch['horizontal_speed']:.3g} m/s along and {touch['tilt']:.3g} deg of tilt"
-            )
-        yield f"ground: {left}{met}; {ground['phase']} at the end"
+        yield _ground_line(numbers["ground"])
     if "computation" in numbers:
         delay = numbers["computation"]["delay_ms"]
         yield (
@@ -237,7 +260,32 @@ def _effect_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
         yield f"RMS error of the measured state: {lengths} m; {angles} deg"
 
 
+def _ground_line(ground: Mapping[str, Any]) -> str:
+    """Return when the vehicle left the ground, how it met it again, and its phase at the end."""
+    if ground["takeoff_time"] is not None:
+        left = f"left it at {ground['takeoff_time']:.2f} s"
+    elif ground["started"] == "flying":
+        left = "started in the air"
+    else:
+        left = "never left it"
+    touchdown = ground["touchdown"]
+    met = ""
+    if touchdown is not None:
+        met = (
+            f", met it at {touchdown['time']:.2f} s with {touchdown['speed']:.3g} m/s down, "
+            f"{touchdown['horizontal_speed']:.3g} m/s along and {touchdown['tilt']:.3g} deg of tilt"
+        )
+    return f"ground: {left}{met}; {ground['phase']} at the end"
+
+
 def _range(lower: float, upper: float) -> str:
+    """Return bounds as a range, `-` for one that there is not."""
     if lower == -upper:
         return f"±{short_number(upper)}"
-    return "..".join(short_number(bound) if math.isfinite(bound) else "-" for bound in (lower, upper))
+    shown_lower = "-"
+    shown_upper = "-"
+    if math.isfinite(lower):
+        shown_lower = short_number(lower)
+    if math.isfinite(upper):
+        shown_upper = short_number(upper)
+    return f"{shown_lower}..{shown_upper}"

@@ -271,7 +271,7 @@ def _verdict(finding: Finding) -> Cell:
         if margin != finding.worst_margin:
             shown += " at the samples"
         text += f" (margin {shown}, tolerance {tolerance:.3g})"
-    return Cell(text=text, mark=_verdict_mark(finding))
+    return Cell(text=text, mark=verdict_mark(finding))
 
 
 def rounded_margin(margin: float, tolerance: float) -> float:
@@ -281,7 +281,8 @@ def rounded_margin(margin: float, tolerance: float) -> float:
     return margin
 
 
-def _verdict_mark(finding: Finding) -> Mark:
+def verdict_mark(finding: Finding) -> Mark:
+    """Return the mark of the verdict on a constraint."""
     if finding.verdict == "satisfied":
         return Mark.GOOD
     if finding.verdict == "violated" and finding.limit.required:
@@ -324,18 +325,18 @@ def _tolerance(finding: Finding) -> Cell:
 def _sampled_margin(finding: Finding) -> Cell:
     margin = finding.worst_margin_sampled
     violated = finding.limit.violated(margin, sampled=True)
-    return _cell(format_number(margin), mark=_verdict_mark(finding), marked=bool(violated))
+    return _cell(format_number(margin), mark=verdict_mark(finding), marked=bool(violated))
 
 
 def _plant_margin(finding: Finding) -> Cell:
     margin = finding.worst_margin
     violated = finding.limit.violated(margin, sampled=False)
-    return _cell(format_number(margin), mark=_verdict_mark(finding), marked=bool(violated))
+    return _cell(format_number(margin), mark=verdict_mark(finding), marked=bool(violated))
 
 
 def _violation(finding: Finding) -> Cell:
     seconds = finding.time_violated
-    return _cell(format_number(seconds), mark=_verdict_mark(finding), marked=seconds > 0.0)
+    return _cell(format_number(seconds), mark=verdict_mark(finding), marked=seconds > 0.0)
 
 
 def _lowest_speed(flight: FlightRecord) -> Cell:

@@ -134,6 +134,11 @@ def format_number(value: float | None) -> str:
     return f"{value:.1e}"
 
 
+def signed_number(value: float, decimals: int) -> str:
+    """A number with its sign and so many decimals, but no "-0.00"."""
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}"
+
+
 def short_number(value: float, unit: str = "") -> str:
     """Three significant digits for a table to glance at, without what is only rounding in its unit; `-` for NaN."""
     if math.isnan(value):

@@ -62,13 +62,13 @@ def live(
 
     onward = isinstance(scenario, str | Path) and names_directory(scenario)
     if onward:
-        if changes or seed is not None:
-            raise ParameterError("", "--set" if changes else "--seed", "given", "absent when a run is continued")
+        for option, given in (("--set", bool(changes)), ("--seed", seed is not None)):
+            if given:
+                raise ParameterError("", option, "given", "absent when a run is continued")
         scenario = reaudit(Path(str(scenario)), products=False).scenario
     flown = load_scenario(scenario, changes, seed)
-    if against is None:
-        other = None
-    else:
+    other = None
+    if against is not None:
         other = load_scenario(against).controller
     place = {"port": port, "host": host, "browser": browser}
     return fly_live(flown, other, script, onward=onward, out=out, overwrite=overwrite, video=video, **place)

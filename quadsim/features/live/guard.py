@@ -12,6 +12,7 @@ import contextlib
 import ipaddress
 import secrets
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException
 from typing import Any, Final
@@ -28,7 +29,7 @@ _UPGRADE: Final = {
     "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
 }
 """What makes of a request one for a WebSocket."""
-_PATIENCE: Final = 10.0  # [s] for an answer of this process
+_ANSWER_TIME: Final = 10.0  # [s] for an answer of this process
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
@@ -50,19 +51,11 @@ class Guard:
         origins = _values(headers, "Origin")
         if len(hosts) > 1 or len(origins) > 1:
             return "a header is there twice"
-        host = next(iter(hosts), "")
-        origin = next(iter(origins), None)
-        if not self._is_ours(host, port):
+        if not hosts or not self._is_ours(hosts[0], port):
             return "this server goes by another name"
-        if origin is not None and not self._is_ours(origin.partition("://")[2], port):
+        if origins and not self._is_ours(origins[0].partition("://")[2], port):
             return "a page of another site may not connect"
-        # Other programs on this host set cookies too, whose form is theirs: only ours is looked at.
-        cookies = []
-        for line in _values(headers, "Cookie"):
-            for pair in line.split(";"):
-                cookies.append(pair.strip().partition("="))
-        tokens = [value for name, _, value in cookies if name == f"quadsim-{port}"]
-        tokens += parse_qs(path.partition("?")[2]).get("token", [])
+        tokens = _cookies(headers, f"quadsim-{port}") + _tokens(path)
         if not any(secrets.compare_digest(token.encode(errors="replace"), self.token.encode()) for token in tokens):
             return "the token is missing, or another session's; where it was given, the browser keeps no cookie for it"
         return None
@@ -76,25 +69,7 @@ class Guard:
         serve = library.serve
 
         def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
-            def check(connection: Any, request: Any) -> Any:
-                port = connection.local_address[1]
-                if refused := self.refusal(request.headers, request.path, port):
-                    return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}. {_HOW_TO_OPEN}\n")
-                if request.path == ADMISSION:
-                    return connection.respond(HTTPStatus.OK, "")
-                request.headers.pop("Accept-Encoding", None)  # the page is packed as it is
-                response = process_request(connection, request)
-                if response is None:  # a WebSocket
-                    return None
-                if response.headers.get("Content-Type", "").startswith("text/html"):
-                    response.body = dress(response.body.decode()).encode()
-                    del response.headers["Content-Length"]
-                    response.headers["Content-Length"] = str(len(response.body))
-                if "token" in parse_qs(request.path.partition("?")[2]):
-                    cookie = f"quadsim-{port}={self.token}"  # its name has the port, which cookies ignore
-                    response.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
-                return response
-
+            check = partial(self._answer, process_request, dress)
             return serve(*args, process_request=check, **options)
 
         library.serve = guarded
@@ -103,6 +78,29 @@ class Guard:
         finally:
             library.serve = serve
 
+    def _answer(
+        self, process_request: Callable[[Any, Any], Any], dress: Callable[[str], str], connection: Any, request: Any
+    ) -> Any:
+        """Return the response to a request: a refusal, or that of the server, its page dressed; None: a WebSocket."""
+        port = connection.local_address[1]
+        refusal = self.refusal(request.headers, request.path, port)
+        if refusal:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refusal}. {_HOW_TO_OPEN}\n")
+        if request.path == ADMISSION:
+            return connection.respond(HTTPStatus.OK, "")
+        request.headers.pop("Accept-Encoding", None)  # the page is packed as it is
+        response = process_request(connection, request)
+        if response is None:
+            return None
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            response.body = dress(response.body.decode()).encode()
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
+        if _tokens(request.path):
+            cookie = f"quadsim-{port}={self.token}"  # its name has the port, which cookies ignore
+            response.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
+        return response
+
     def require_closed(self, port: int) -> None:
         """Try the door of the server on this port without the token: with a request for the page, and by WebSocket.
 
@@ -110,12 +108,13 @@ class Guard:
             InputError: it does not refuse both, so whoever finds the port could fly.
         """
         address = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
-        answers = [_status(address, port, headers) for headers in ({}, _UPGRADE)]
-        if answers != [HTTPStatus.FORBIDDEN] * 2:
-            said = " and ".join(str(answer or "nothing") for answer in answers)
+        of_page = _status(address, port, {})
+        of_websocket = _status(address, port, _UPGRADE)
+        if of_page != HTTPStatus.FORBIDDEN or of_websocket != HTTPStatus.FORBIDDEN:
             raise InputError(
-                f"quadsim live needs a viser whose server can be guarded: without the token, this one answers {said} "
-                f"in place of {HTTPStatus.FORBIDDEN:d}; install another version of viser or websockets"
+                "quadsim live needs a viser whose server can be guarded: without the token, this one answers "
+                f"{of_page or 'nothing'} and {of_websocket or 'nothing'} in place of {HTTPStatus.FORBIDDEN:d}; "
+                "install another version of viser or websockets"
             )
 
     def _is_ours(self, netloc: str, port: int) -> bool:
@@ -126,8 +125,10 @@ class Guard:
             its_port = parts.port
         except ValueError:
             return False
-        if its_port != port or host in LOOPBACK or host == self._host:
-            return its_port == port
+        if its_port != port:
+            return False
+        if host in LOOPBACK or host == self._host:
+            return True
         with contextlib.suppress(ValueError):  # no site can be bound to the name of an address
             return self._host not in LOOPBACK and bool(ipaddress.ip_address(host))
         return False
@@ -142,9 +143,26 @@ def _values(headers: Any, name: str) -> list[str]:
     return []
 
 
+def _cookies(headers: Any, wanted: str) -> list[str]:
+    """Return the values of a cookie; other programs on this host set cookies too, in any form."""
+    values = []
+    for line in _values(headers, "Cookie"):
+        for pair in line.split(";"):
+            name, _, value = pair.strip().partition("=")
+            if name == wanted:
+                values.append(value)
+    return values
+
+
+def _tokens(path: str) -> list[str]:
+    """Return the tokens in the query of a path."""
+    query = path.partition("?")[2]
+    return parse_qs(query).get("token", [])
+
+
 def _status(address: str, port: int, headers: Mapping[str, str]) -> int | None:
     """Return how the server at an address answers a request for its page, or None without an answer."""
-    connection = HTTPConnection(address, port, timeout=_PATIENCE)
+    connection = HTTPConnection(address, port, timeout=_ANSWER_TIME)
     try:
         connection.request("GET", "/", headers=headers)
         return connection.getresponse().status

@@ -1,10 +1,8 @@
 """What the clients of a live session's page may send: every message is checked before anything acts on it.
 
-A message of a kind that this page has no use for, with a number that is not finite, or of another form is dropped.
-What is no message of viser's at all ends that client's connection, and no other.
-
-All pages share the widgets, so that what a watcher gives would be the driver's next value: only the driver changes a
-widget, and only to a value that the widget itself offers.
+A message of a kind that this page has no use for, with a number that is not finite, or of another form is dropped;
+what is no message of viser's at all ends that client's connection, and no other.  All pages share the widgets: only
+the driver changes one, and only to a value that the widget itself offers.
 """
 
 from __future__ import annotations
@@ -14,6 +12,8 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
 from viser import _messages
+
+from quadsim.features.live.readout import NOT_DRIVING
 
 Handler = Callable[[int, Any], Awaitable[None]]
 _LONGEST: Final = 1000  # characters of a text, or entries of a list
@@ -42,7 +42,7 @@ _FORMS: Final[dict[type, dict[str, Any]]] = {
     _messages.GuiUpdateMessage: {"uuid": str, "updates": dict},
 }
 """The messages that this page's clients send; of their fields the type, or how many numbers they have."""
-_OF_THE_DRIVER: Final = (
+_DRIVER_ONLY: Final = (
     _messages.TransformControlsUpdateMessage,
     _messages.TransformControlsDragStartMessage,
     _messages.TransformControlsDragEndMessage,
@@ -77,7 +77,7 @@ class Incoming:
 
     def _check_shared(self, client: int, message: Any) -> bool:
         """Return whether a message may act on what all pages share."""
-        if isinstance(message, _OF_THE_DRIVER):
+        if isinstance(message, _DRIVER_ONLY):
             return self._drives(client)
         if not isinstance(message, _messages.GuiUpdateMessage):
             return True  # these change nothing by themselves: `Widgets.on` knows who drives
@@ -94,7 +94,7 @@ class Incoming:
         page = self._server.get_clients().get(client)
         if page is None:
             return
-        page.add_notification("You watch", "Another page has the controls: Take the controls changes that.")
+        page.add_notification(*NOT_DRIVING)
         if not widget._impl.is_button:
             in_force = _messages.GuiUpdateMessage(widget._impl.uuid, {"value": widget.value})
             page._websock_connection.queue_message(in_force)
@@ -105,17 +105,16 @@ def is_well_formed(message: Any) -> bool:
     form = _FORMS.get(type(message))
     if form is None or not _is_plain(vars(message)):
         return False
-    for name, kind in form.items():
-        value = getattr(message, name, None)
-        if isinstance(kind, int):
-            right = isinstance(value, list | tuple) and len(value) == kind and all(map(_is_number, value))
-        elif kind is _NUMBER:
-            right = _is_number(value)
-        else:
-            right = isinstance(value, kind)
-        if not right:
-            return False
-    return True
+    return all(_has_form(getattr(message, name, None), kind) for name, kind in form.items())
+
+
+def _has_form(value: Any, kind: Any) -> bool:
+    """Return whether a value is of a type, a number, or of so many numbers."""
+    if isinstance(kind, int):
+        return isinstance(value, list | tuple) and len(value) == kind and all(map(_is_number, value))
+    if kind is _NUMBER:
+        return _is_number(value)
+    return isinstance(value, kind)
 
 
 def offers(widget: Any, value: Any) -> bool:
@@ -135,13 +134,13 @@ def offers(widget: Any, value: Any) -> bool:
     low = getattr(props, "min", None)
     high = getattr(props, "max", None)
     if isinstance(present, tuple):
-        if not isinstance(value, list | tuple) or len(value) != len(present):
-            return False
-        lows = [None] * len(present) if low is None else low
-        highs = [None] * len(present) if high is None else high
-        return all(map(_is_within, value, lows, highs))
-    whole = isinstance(present, int)
-    return _is_within(value, low, high) and (not whole or float(value).is_integer())
+        count = len(present)
+        lows = low or [None] * count
+        highs = high or [None] * count
+        return isinstance(value, list | tuple) and len(value) == count and all(map(_is_within, value, lows, highs))
+    if isinstance(present, int):
+        return _is_within(value, low, high) and float(value).is_integer()
+    return _is_within(value, low, high)
 
 
 def _is_within(value: Any, low: float | None, high: float | None) -> bool:

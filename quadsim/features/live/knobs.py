@@ -55,28 +55,50 @@ class Knob:
 
 def knobs(spec: AnyController) -> tuple[Knob, ...]:
     """Return the fields of a controller, except its type, long lists and settings of user-defined controllers."""
-    return tuple(knob for knob in _walk("", spec, (Kind(type=type(spec)),), "") if knob.path != "type")
+    fields = _fields("", spec, (Kind(type=type(spec)),), "")
+    return tuple(knob for knob in fields if knob.path != "type")
 
 
-def _walk(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
-    below = f"{path}." if path else ""
-    entries = [entry for kind in kinds for entry in kind.entries]
-    pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(n, int | float) for n in value)
+def _fields(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
+    """Yield the fields of a value at a path, which is of one of some kinds; `about` is what the path is about."""
     if is_table(type(value)):
         for name, field in fields_of(type(value)).items():
             inner = kinds_of(field.annotation, tuple(field.metadata))
-            yield from _walk(f"{below}{name}", getattr(value, name), inner, field.description or about)
+            yield from _fields(_below(path, name), getattr(value, name), inner, field.description or about)
     elif isinstance(value, Mapping):
         for name, entry in value.items():
-            yield from _walk(f"{below}{name}", entry, entries, about)
+            yield from _fields(_below(path, name), entry, _kinds_of_entries(kinds), about)
     elif isinstance(value, str):
-        choices = tuple(str(choice) for kind in kinds for choice in kind.choices)
+        choices = [str(choice) for kind in kinds for choice in kind.choices]
         if len(choices) > 1:  # else there is nothing to choose
-            yield Knob(path=path, value=value, about=about, choices=choices)
-    elif pair or isinstance(value, int | float):
-        numbers = entries if pair else kinds
-        limits = next((kind.limits for kind in numbers if kind.type in (float, int, bool)), None)
-        if limits is not None:  # else it is what a user's controller reads
-            low, high = (limits.get(inside, limits.get(beyond)) for inside, beyond in (("ge", "gt"), ("le", "lt")))
-            turned = tuple(map(float, value)) if pair else value
-            yield Knob(path=path, value=turned, about=about, minimum=low, maximum=high)
+            yield Knob(path=path, value=value, about=about, choices=tuple(choices))
+    elif isinstance(value, int | float):
+        yield from _number(path, value, kinds, about)
+    elif isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(n, int | float) for n in value):
+        first, second = value
+        yield from _number(path, (float(first), float(second)), _kinds_of_entries(kinds), about)
+
+
+def _below(path: str, name: str) -> str:
+    if path:
+        return f"{path}.{name}"
+    return name
+
+
+def _kinds_of_entries(kinds: Sequence[Kind]) -> list[Kind]:
+    """Return the kinds that an entry of a table or list may have."""
+    entries = list[Kind]()
+    for kind in kinds:
+        entries += kind.entries
+    return entries
+
+
+def _number(path: str, value: KnobValue, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
+    """Yield a field of a number or a pair, with its limits; nothing if its declaration is of no number."""
+    for kind in kinds:
+        if kind.type in (float, int, bool):
+            low = kind.limits.get("ge", kind.limits.get("gt"))
+            high = kind.limits.get("le", kind.limits.get("lt"))
+            yield Knob(path=path, value=value, about=about, minimum=low, maximum=high)
+            return
+    # else it is what a user's controller reads

@@ -18,9 +18,9 @@ from PIL import Image
 from quadsim.sim.airframe import BODY
 from quadsim.space import Obstacle
 
-_SQUARES: Final = (144, 154, 162), (155, 165, 173)
+_SQUARES: Final = ((144, 154, 162), (155, 165, 173))
 _SEAM: Final = (172, 180, 188)
-_REACH: Final = 100.0  # squares from the middle of the floor to where it has faded
+_FADED: Final = 100.0  # squares from the middle of the floor to where it has faded
 _ICON: Final = """<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32' fill='none' stroke-width='3'>
 <path d='M8 8 24 24M8 24 24 8' stroke='#7a7f87'/><path d='M2 24a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0
 1 0-12 0' stroke='#1b7fc4'/><path d='M2 8a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0 1 0-12 0'
@@ -78,9 +78,12 @@ def dressed(page: str, title: str, *, served: bool = False) -> str:
 
     Where it is `served`, it asks whether it may connect, and shows the reason if it may not; a gamepad steers.
     """
+    head = _HEAD
+    if served:
+        head = _HEAD + _ASKING + _GAMEPAD
     page = re.sub('data:image/svg[^"]*', "data:image/svg+xml," + quote(_ICON), page, count=1)
-    page = re.sub("<title>.*?</title>", lambda found: f"<title>{escape(title)}</title>", page, count=1)
-    return page.replace("</head>", f"{_HEAD}{_ASKING + _GAMEPAD if served else ''}</head>", 1)
+    page = re.sub("<title>.*?</title>", lambda old: f"<title>{escape(title)}</title>", page, count=1)
+    return page.replace("</head>", f"{head}</head>", 1)
 
 
 def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], trimesh.Trimesh]]:
@@ -90,18 +93,22 @@ def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], tr
     body = model.body(BODY).id
     parts = defaultdict[int, list[trimesh.Trimesh]](list)
     for geom in range(model.ngeom):
-        if model.body_rootid[model.geom_bodyid[geom]] == body and model.geom_group[geom] <= 2:
+        is_part = model.body_rootid[model.geom_bodyid[geom]] == body
+        is_visible = model.geom_group[geom] <= 2
+        if is_part and is_visible:
             kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
             place = data.geom_xpos[geom] - data.xpos[body]
             turn = data.geom_xmat[geom].reshape(3, 3)
-            parts[model.geom_matid[geom]].append(_solid(kind, model.geom_size[geom], place, turn))
+            parts[model.geom_matid[geom]].append(_mesh(kind, model.geom_size[geom], place, turn))
     for material, meshes in parts.items():
-        yield model.material(material).name, tuple(model.mat_rgba[material].tolist()), trimesh.util.concatenate(meshes)
+        colour = tuple(model.mat_rgba[material].tolist())
+        yield model.material(material).name, colour, trimesh.util.concatenate(meshes)
 
 
 def obstacle(shape: Obstacle) -> trimesh.Trimesh:
     """Return an obstacle, relative to its position."""
-    return trimesh.util.concatenate([_solid(s.kind, s.size, s.centre, s.turn) for s in shape.solids])
+    meshes = [_mesh(solid.kind, solid.size, solid.centre, solid.turn) for solid in shape.solids]
+    return trimesh.util.concatenate(meshes)
 
 
 def floor(square: float) -> bytes:
@@ -110,26 +117,12 @@ def floor(square: float) -> bytes:
     What is transparent is drawn in the order of its bounding box's middle, from far to near: a vertex without a face,
     far below, lets the floor be the first.
     """
-    picture = np.empty((128, 128, 3), np.uint8)  # of two by two squares
-    picture[:] = _SQUARES[1]
-    picture[:64, :64] = _SQUARES[0]
-    picture[64:, 64:] = _SQUARES[0]
-    picture[[0, -1]] = picture[:, [0, -1]] = _SEAM
     around = np.linspace(0.0, 2.0 * np.pi, 33)
-    points = _REACH * np.pad(np.stack([np.cos(around), np.sin(around)], axis=1), ((1, 0), (0, 1)))
-    points = np.concatenate([points, [(0.0, 0.0, -_REACH)]])
+    points = _FADED * np.pad(np.stack([np.cos(around), np.sin(around)], axis=1), ((1, 0), (0, 1)))
+    points = np.concatenate([points, [(0.0, 0.0, -_FADED)]])
     fading = np.ones((len(points), 4), np.float32)
     fading[1:, 3] = 0.0
-
-    def finish(tree: dict[str, Any]) -> None:
-        tree["extensionsUsed"] = ["KHR_materials_unlit"]
-        tree["samplers"] = [{"minFilter": 9985, "magFilter": 9729}]  # not trilinear: twice the frames without a GPU
-        tree["textures"][0]["sampler"] = 0
-        tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
-        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
-        attributes["COLOR_0"] = attributes.pop("_color")
-
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture), alphaMode="BLEND")
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=_two_by_two_squares(), alphaMode="BLEND")
     mesh = trimesh.Trimesh(
         square * points,
         [(0, i, i + 1) for i in range(1, len(points) - 2)],
@@ -137,14 +130,36 @@ def floor(square: float) -> bytes:
         vertex_attributes={"color": fading},
         process=False,
     )
-    data: bytes = mesh.export(file_type="glb", tree_postprocessor=finish)
+    data: bytes = mesh.export(file_type="glb", tree_postprocessor=_unlit)
     return data
+
+
+def _two_by_two_squares() -> Image.Image:
+    """Return what the floor repeats."""
+    picture = np.empty((128, 128, 3), np.uint8)
+    picture[:] = _SQUARES[1]
+    picture[:64, :64] = _SQUARES[0]
+    picture[64:, 64:] = _SQUARES[0]
+    picture[[0, -1]] = _SEAM
+    picture[:, [0, -1]] = _SEAM
+    return Image.fromarray(picture)
+
+
+def _unlit(tree: dict[str, Any]) -> None:
+    """Change a GLB's table: no light, a cheap filter of the texture, and a colour for each vertex."""
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
+    tree["samplers"] = [{"minFilter": 9985, "magFilter": 9729}]  # not trilinear: twice the frames without a GPU
+    tree["textures"][0]["sampler"] = 0
+    tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = attributes.pop("_color")
 
 
 def square_side(arm: float) -> float:
     """Return the side of the floor's squares [m]: 1, 2 or 5 times a power of ten, up to four arms."""
-    power = 10.0 ** math.floor(math.log10(4.0 * arm))
-    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= 4.0 * arm)
+    most = 4.0 * arm
+    power = 10.0 ** math.floor(math.log10(most))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= most)
 
 
 def grip(radius: float) -> trimesh.Trimesh:
@@ -158,8 +173,8 @@ def disc(radius: float) -> trimesh.Trimesh:
     return trimesh.creation.cylinder(radius, 0.01 * radius, sections=32)
 
 
-def _solid(kind: str, size: Any, centre: Any, turn: Any) -> trimesh.Trimesh:
-    """MuJoCo's shape of that kind and size [m]."""
+def _mesh(kind: str, size: Any, centre: Any, turn: Any) -> trimesh.Trimesh:
+    """MuJoCo's shape of that kind and size [m], at a place and turned."""
     a, b, c = map(float, size)
     match kind:
         case "box":
@@ -168,8 +183,10 @@ def _solid(kind: str, size: Any, centre: Any, turn: Any) -> trimesh.Trimesh:
             mesh = trimesh.creation.cylinder(a, 2.0 * b, sections=24)
         case "capsule":
             mesh = trimesh.creation.capsule(2.0 * b, a, count=(8, 8))
+        case "ellipsoid":
+            mesh = trimesh.creation.icosphere(2).apply_scale((a, b, c))
         case _:
-            mesh = trimesh.creation.icosphere(2).apply_scale((a, b, c) if kind == "ellipsoid" else a)
+            mesh = trimesh.creation.icosphere(2).apply_scale(a)
     pose = np.eye(4)
     pose[:3, :3] = turn
     pose[:3, 3] = centre

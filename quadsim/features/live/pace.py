@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time as clock
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from quadsim.errors import QuadsimError
@@ -14,6 +14,7 @@ from quadsim.features.live.session import Frame, Session
 LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
 POSES: Final = 2  # drawn in each period
 _IDLE: Final = 0.02  # [s] between looks for orders while nothing is flown
+_MEASURED: Final = 2.0  # [s] of flight over which the real-time factor is measured
 
 
 class Pace:
@@ -42,12 +43,12 @@ class Pace:
 
     def drive(self, session: Session, view: Any, until: Callable[[Frame], bool] = lambda frame: False) -> None:
         """Fly until `stop` or the last frame, shown by a `Page`; a flight that ended waits for a reset."""
-        # two seconds
         due = self._now()
-        recent = deque[float](maxlen=round(2.0 / session.period) + 1)
+        recent = deque[float](maxlen=round(_MEASURED / session.period) + 1)  # when periods were flown
         while not self._stop.is_set():
             while self._orders:
-                self._orders.popleft()(session)
+                order = self._orders.popleft()
+                order(session)
             if session.reason is not None or (self.paused and not self._single.acquire(blocking=False)):
                 self._stop.wait(_IDLE)
                 due = self._now()
@@ -60,15 +61,26 @@ class Pace:
                 view.ended(session.reason)
                 continue
             recent.append(self._now())
-            span = recent[-1] - recent[0]
-            view.show(frame, (len(recent) - 1) * session.period / span if span > 0.0 else self.speed)
+            view.show(frame, self._factor(recent, session.period))
             for share in range(1, POSES + 1):
                 view.pose(frame, share / POSES)
-                due += session.period / self.speed / POSES
-                if (late := self._now() - due) > LATE:
-                    due += late
-                self._stop.wait(max(0.0, -late))
+                due = self._wait(due + session.period / self.speed / POSES)
             if session.reason is not None:
                 view.ended(session.reason)
             if until(frame):
                 return
+
+    def _factor(self, recent: Sequence[float], period: float) -> float:
+        """Return simulated over real time, from when the recent periods were flown; what is aimed at without any."""
+        span = recent[-1] - recent[0]
+        if span > 0.0:
+            return (len(recent) - 1) * period / span
+        return self.speed
+
+    def _wait(self, due: float) -> float:
+        """Wait until a time; return it, or a later one where too much time is lost to be made up for."""
+        late = self._now() - due
+        if late > LATE:
+            due += late
+        self._stop.wait(max(0.0, -late))
+        return due

@@ -14,12 +14,12 @@ import socket
 import time as clock
 import warnings
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import viser
@@ -27,13 +27,16 @@ from viser import _messages
 
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.live import readout
-from quadsim.features.live.controls import BREAKS, ControllerTab, Steering, Widgets, disturb
+from quadsim.features.live.controller_tab import ControllerTab
+from quadsim.features.live.disturb_tab import disturb
 from quadsim.features.live.guard import Guard
 from quadsim.features.live.incoming import Incoming
 from quadsim.features.live.look import dressed
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Frame, Session
 from quadsim.features.live.stage import FIELD, VIEW, Stage
+from quadsim.features.live.steering_tab import Steering
+from quadsim.features.live.widgets import BREAKS, Widgets
 from quadsim.mpc.laws import law_name
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import least_range
@@ -44,10 +47,10 @@ from quadsim.sim.physics import Period
 from quadsim.state import POSITION, Array, wrapped
 
 SECONDS: Final = 20.0  # of the plots
-_EVERY: Final = 4
+_PANEL_PERIODS: Final = 4
 """Periods from one update of the panel to the next, a fifth of a second at 20 Hz; plots take two of these."""
 _SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
-_STRANGE: Final = 5.0  # [s] after which a page's camera is where a person has turned it
+_OPENING: Final = 5.0  # [s] after which a page's camera is where a person has turned it
 _PLOTS: Final = {
     "Position error [m]": {"x": "x_error", "y": "y_error", "z": "z_error"},
     "Attitude [deg]": {"roll": "roll", "pitch": "pitch", "tilt": "tilt", "yaw error": "yaw_error"},
@@ -102,25 +105,12 @@ class Page:
         self._session = session
         self._pace = pace
         self._save = save
-        guard = Guard(host)
-        silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
         title = f"quadsim live: {session.scenario.name}"
-        with silent, guard.installed(partial(dressed, title=title, served=True)):
-            self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
-        listening = self._server.get_port()
-        if port not in (0, listening):
-            self.close()
-            raise ParameterError("", "--port", port, "a port that is free")
-        try:
-            guard.require_closed(listening)
-        except InputError:
-            self.close()
-            raise
-        for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
-            self._server._websock_server.unregister_handler(message)
+        guard = Guard(host)
+        listening = self._serve(guard, title, host, port)
+        self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._driver: int | None = None
         Incoming(self._server, self._drives)
-        self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._takes: dict[int, list[Any]] = {}  # of each client, what a watcher sees
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
         self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
@@ -134,7 +124,7 @@ class Page:
         self._server.gui.set_panel_label(title)
         self._server.gui.main_panel.dock_right()
         self.stage = Stage(self._server.scene, session)
-        self._away = self.stage.unit * VIEW
+        self._away = self.stage.unit * VIEW  # from the vehicle to a page's camera [m]
         start = np.asarray(session.flights[0].loop.course.row(0)[:3])
         camera = self._server.initial_camera
         camera.position = start + self._away
@@ -144,6 +134,29 @@ class Page:
         self._build(others)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._left)
+
+    def _serve(self, guard: Guard, title: str, host: str, port: int) -> int:
+        """Start the server, which a guard has to protect; return its port.
+
+        Raises:
+            ParameterError: the port is taken.
+            InputError: the guard does not protect it.
+        """
+        silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
+        with silent, guard.installed(partial(dressed, title=title, served=True)):
+            self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
+        listening: int = self._server.get_port()
+        if port not in (0, listening):
+            self.close()
+            raise ParameterError("", "--port", port, "a port that is free")
+        try:
+            guard.require_closed(listening)
+        except InputError:
+            self.close()
+            raise
+        for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
+            self._server._websock_server.unregister_handler(message)
+        return listening
 
     def close(self) -> None:
         """Stop serving."""
@@ -156,55 +169,65 @@ class Page:
         """Show a flown period."""
         self._frame = frame
         self._factor = factor
-        values = [None if sample is None else _values(sample) for sample in frame.samples]
-        if values[0] is not None:
+        values = [_values(sample) for sample in frame.samples if sample is not None]
+        if frame.samples[0] is not None:
             self._history.append((frame.time, *values[0]))
         self._constraints.add(frame)
         with _unless_gone():
             for reason in frame.refused:
                 for client in self._server.get_clients().values():
                     client.add_notification("Refused", reason, color="red", auto_close_seconds=8.0)
+        is_time_for_panel = frame.k % _PANEL_PERIODS == 0 or self._pace.paused
+        is_time_for_plots = frame.k % (2 * _PANEL_PERIODS) == 0 or self._pace.paused
         with self._server.atomic():
             self.stage.show(frame)
-            if frame.k % _EVERY == 0 or self._pace.paused:
-                self._announce()
-                self._widgets.follow()
-                loops = [flight.loop for flight in self._session.flights[1:]]
-                lost = []
-                for loop in loops:
-                    if loop.reason:
-                        lost.append(f"{law_name(loop.controller.name)} lost: {loop.reason}")
-                states = []
-                for value in values:
-                    if value is not None:
-                        states.append((value[5], math.hypot(*value[:3])))
-                self._numbers.content = readout.readings(frame, states, lost)
-                audited = {limit.name for limit in self._session.limits}
-                self._margins.content = self._constraints.rows(frame, audited)
-            if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
-                time, *rows = np.array(self._history)[::2].T  # plots are the most of what is sent
-                left = iter(rows)
-                ends = {limit.name: limit.stop for limit in self._session.limits}
-                for plot, bounds, (title, names) in zip(self._plots, self._bounds, _PLOTS.items(), strict=True):
-                    lines = [bound.curve(time, ends) for bound in bounds]
-                    curves = [*islice(left, len(names)), *lines]
-                    series = _series(names, [bool(np.isfinite(line).any()) for line in lines])
-                    if series != plot.series:  # which draws the plot anew
-                        plot.series = series
-                    least = least_range(curves, title[title.index("[") + 1 : -1])
-                    scales = _TIME if least is None else {**_TIME, "y": {"range": least}}
-                    if scales != plot.scales:  # likewise
-                        plot.scales = scales
-                    plot.data = (time, *curves)
+            if is_time_for_panel:
+                self._show_panel(frame, values)
+            if is_time_for_plots and len(self._history) > 1:
+                self._show_plots()
+
+    def _show_panel(self, frame: Frame, values: Sequence[_Values]) -> None:
+        """Update the panel's texts and widgets; `values` are those of the vehicles that still fly."""
+        self._announce()
+        self._widgets.follow()
+        lost = []
+        for flight in self._session.flights[1:]:
+            if flight.loop.reason:
+                lost.append(f"{law_name(flight.loop.controller.name)} lost: {flight.loop.reason}")
+        states = [(value.tilt, math.hypot(value.x, value.y, value.z)) for value in values]
+        self._numbers.content = readout.readings(frame, states, lost)
+        audited = {limit.name for limit in self._session.limits}
+        self._margins.content = self._constraints.rows(frame, audited)
+
+    def _show_plots(self) -> None:
+        """Send the plots, which are the most of what is sent: every second period."""
+        time, *rows = np.array(self._history)[::2].T
+        curves_left = iter(rows)
+        ends = {limit.name: limit.stop for limit in self._session.limits}
+        for plot, bounds, (title, names) in zip(self._plots, self._bounds, _PLOTS.items(), strict=True):
+            lines = [bound.curve(time, ends) for bound in bounds]
+            curves = [*islice(curves_left, len(names)), *lines]
+            series = _series(names, [bool(np.isfinite(line).any()) for line in lines])
+            if series != plot.series:  # which draws the plot anew
+                plot.series = series
+            unit = title[title.index("[") + 1 : -1]
+            least = least_range(curves, unit)
+            scales: dict[str, Any] = _TIME
+            if least is not None:
+                scales = {**_TIME, "y": {"range": least}}
+            if scales != plot.scales:  # likewise
+                plot.scales = scales
+            plot.data = (time, *curves)
 
     def pose(self, frame: Frame, share: float) -> None:
         """Draw the vehicles, and let cameras follow."""
         with _unless_gone(), self._server.atomic():
             at = self.stage.pose(frame, share)
-            for number, client in self._server.get_clients().items() if self._follow.value else ():
-                if number in self._aims:  # where it looks moves with it
-                    camera = client.camera
-                    camera.position = camera.position + (at + self._aims[number] - camera.look_at)
+            if self._follow.value:
+                for number, client in self._server.get_clients().items():
+                    if number in self._aims:  # where it looks moves with it
+                        camera = client.camera
+                        camera.position = camera.position + (at + self._aims[number] - camera.look_at)
         self._server.flush()
 
     def ended(self, reason: str) -> None:
@@ -215,6 +238,7 @@ class Page:
     # What is on the page
 
     def _build(self, others: Mapping[str, AnyController]) -> None:
+        """Fill the panel; `others` are controllers that may take over."""
         gui = self._server.gui
         gui.add_html(readout.READOUT_STYLE)
         self._overlay = gui.add_html(readout.hints(self._used, self._names))
@@ -222,14 +246,7 @@ class Page:
         self._numbers = gui.add_html(readout.readings(None))
         self._margins = gui.add_html("")
         with gui.add_folder("Run"):
-            toggles = {"Pause": self._toggle, "Resume": self._toggle}  # one at a time
-            self._flight = self._widgets.group("Flight", {**toggles, "Step": self._step})
-            outputs = {"Save": self._keep, "Scenario": self._download, "Replay": self._scene}
-            self._widgets.group("Output", outputs, hint=readout.OUTPUT)
-            speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
-            self._widgets.on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
-            self._follow = gui.add_checkbox("Camera follows", True)
-            self._widgets.button("Reset", self._reset, hint="begin anew; what was not saved is lost", color=BREAKS)
+            self._add_run()
         tabs = gui.add_tab_group()
         with tabs.add_tab("Disturb"):
             disturb(self._widgets, self.stage, self._use)
@@ -238,19 +255,33 @@ class Page:
         with tabs.add_tab("Controller"):
             self._controller = ControllerTab(self._widgets, others, self._doing)
         with tabs.add_tab("Plots"):
-            self._bounds = [_lines_of(self._session, title) for title in _PLOTS]
-            self._plots = [
-                gui.add_uplot(
-                    (np.array([0.0, 1.0]), *([np.zeros(2)] * (len(names) + len(bounds)))),
-                    _series(names, [False] * len(bounds)),
-                    scales=_TIME,
-                    aspect=1.9,
-                    title=title,
-                    **_LOOK,
-                )
-                for (title, names), bounds in zip(_PLOTS.items(), self._bounds, strict=True)
-            ]
+            self._add_plots()
         self._announce()
+
+    def _add_run(self) -> None:
+        """Add the buttons of the flight and its outputs, its speed and the camera."""
+        gui = self._server.gui
+        flight_buttons = {"Pause": self._toggle, "Resume": self._toggle, "Step": self._step}
+        self._flight = self._widgets.group("Flight", flight_buttons)  # of the first two one at a time
+        outputs = {"Save": self._keep, "Scenario": self._download, "Replay": self._scene}
+        self._widgets.group("Output", outputs, hint=readout.OUTPUT)
+        speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
+        self._widgets.on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
+        self._follow = gui.add_checkbox("Camera follows", True)
+        self._widgets.button("Reset", self._reset, hint="begin anew; what was not saved is lost", color=BREAKS)
+
+    def _add_plots(self) -> None:
+        """Add the plots, empty, with a curve for each of their bounds."""
+        self._bounds: list[list[_Line]] = []
+        self._plots: list[Any] = []
+        for title, names in _PLOTS.items():
+            bounds = _lines_of(self._session, title)
+            curves = [np.zeros(2)] * (len(names) + len(bounds))
+            data = (np.array([0.0, 1.0]), *curves)
+            series = _series(names, [False] * len(bounds))
+            plot = self._server.gui.add_uplot(data, series, scales=_TIME, aspect=1.9, title=title, **_LOOK)
+            self._bounds.append(bounds)
+            self._plots.append(plot)
 
     # Buttons
 
@@ -267,16 +298,23 @@ class Page:
 
     def _announce(self) -> None:
         """Show what the session does now."""
-        if self._activity:
-            state = self._activity
-        elif self._session.reason is not None:
-            state = "ended"
-        elif self._pace.paused:
-            state = "ready" if self._frame is None else "paused"
+        self._headline.content = readout.status_line(self._state(), self._frame, self._factor)
+        if self._pace.paused:
+            self._flight.options = ("Resume", "Step")
         else:
-            state = "flying"
-        self._headline.content = readout.status_line(state, self._frame, self._factor)
-        self._flight.options = ("Resume" if self._pace.paused else "Pause", "Step")
+            self._flight.options = ("Pause", "Step")
+
+    def _state(self) -> str:
+        """Return what the session does now, in a word or two."""
+        if self._activity:
+            return self._activity
+        if self._session.reason is not None:
+            return "ended"
+        if not self._pace.paused:
+            return "flying"
+        if self._frame is None:
+            return "ready"
+        return "paused"
 
     def _use(self, hint: str) -> None:
         """Take a hint away that a person has followed."""
@@ -318,7 +356,8 @@ class Page:
         with self._doing("saving"):
             try:
                 flight = await self._ask(lambda session: session.flight())
-                result = f"saved: {await asyncio.to_thread(self._save, flight)}, on the machine that flies"
+                place = await asyncio.to_thread(self._save, flight)
+                result = f"saved: {place}, on the machine that flies"
             except (InputError, OutputError) as error:
                 result = f"not saved: {error}"
         with _unless_gone():
@@ -340,33 +379,49 @@ class Page:
         return client == self._driver
 
     async def _connected(self, client: Any) -> None:
+        """Let the first client drive, the others watch."""
         if self._driver is None:
             self._driver = client.client_id
         if self._frame is None and self._pace.waiting:  # the clock starts with the first page
-            self._pace.waiting = self._pace.paused = False
+            self._pace.waiting = False
+            self._pace.paused = False
             self._announce()
-        upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        aim = np.array([0.0, 0.0, -0.3 * np.linalg.norm(self._away)]) * upright
-        connected = clock.monotonic()
-
-        async def moved(camera: Any) -> None:  # a page reports viser's own place before it hears of ours
-            away = camera.position - camera.look_at
-            if np.allclose(away, self._away, atol=0.1 * self.stage.unit) or clock.monotonic() > connected + _STRANGE:
-                self._aims.setdefault(client.client_id, aim)
-
-        client.camera.on_update(moved)
-        if upright:  # more of the floor to tap; it has no Shift key, and viser's clicks of the scene ignore touches
-            below = (0.0, 0.0, self.stage.ground - self.stage.unit)  # it would hide what is behind it
-            floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, opacity=1e-3)
-            self._widgets.on(floor.on_click(), self._steering.clicked)
-            client.camera.fov = 1.4 * FIELD
+        is_upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
+        aim = np.zeros(3)
+        if is_upright:
+            aim[2] = -0.3 * np.linalg.norm(self._away)
+            self._add_tapped_floor(client)
+        self._follow_with(client, aim)
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches, color="orange")
         self._takes[client.client_id] = [note, take]
         take.on_click(partial(self._hand_over, client.client_id))
 
+    def _follow_with(self, client: Any, aim: Array) -> None:
+        """Let a client's camera follow the vehicle, looking at a point from it [m], once its page has it in place.
+
+        A page reports viser's own place before it hears of ours.
+        """
+        connected = clock.monotonic()
+
+        async def moved(camera: Any) -> None:
+            away = camera.position - camera.look_at
+            in_place = np.allclose(away, self._away, atol=0.1 * self.stage.unit)
+            if in_place or clock.monotonic() > connected + _OPENING:
+                self._aims.setdefault(client.client_id, aim)
+
+        client.camera.on_update(moved)
+
+    def _add_tapped_floor(self, client: Any) -> None:
+        """Show a phone more of the floor, to tap: it has no Shift key, and viser's own clicks ignore touches."""
+        below = (0.0, 0.0, self.stage.ground - self.stage.unit)  # it would hide what is behind it
+        floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, opacity=1e-3)
+        self._widgets.on(floor.on_click(), self._steering.clicked)
+        client.camera.fov = 1.4 * FIELD
+
     async def _left(self, client: Any) -> None:
+        """Forget a client; another one gets its controls."""
         self._aims.pop(client.client_id, None)
         self._takes.pop(client.client_id, None)
         if self._driver == client.client_id:
@@ -388,17 +443,17 @@ def _series(names: Collection[str], bounds: Collection[bool]) -> tuple[dict[str,
 
     The legend has one entry for all bounds: `readout.READOUT_STYLE` hides the others.
     """
-    curves = [{"label": name, "stroke": colour} for name, colour in zip(names, CYCLE, strict=False)]
-    lines = []
-    named = False
+    series: list[dict[str, Any]] = [{"label": "t [s]"}]
+    for name, colour in zip(names, CYCLE, strict=False):
+        series.append({"label": name, "stroke": colour})
+    has_entry = False
     for shown in bounds:
-        if named or not shown:
-            further = {"class": readout.FURTHER}
+        if shown and not has_entry:
+            series.append({**_BOUND, "show": shown})
+            has_entry = True
         else:
-            further = {}
-        named = named or shown
-        lines.append({**_BOUND, **further, "show": shown})
-    return {"label": "t [s]"}, *curves, *lines
+            series.append({**_BOUND, "class": readout.FURTHER, "show": shown})
+    return tuple(series)
 
 
 @dataclass(frozen=True)
@@ -422,25 +477,59 @@ def _lines_of(session: Session, title: str) -> list[_Line]:
     """Return the bounds of a plot, each once."""
     if title.startswith("Step"):
         return [_Line("", 1e3 * session.period, 0.0)]
-    limits = [limit for limit in session.limits if limit.signal in _PLOTS[title].values()]
-    ends = {}
-    for limit in limits:
+    lines = {}
+    for limit in session.limits:
+        if limit.signal not in _PLOTS[title].values():
+            continue
         for value in (limit.lower, limit.upper):
-            ends[(value, limit.start, limit.stop)] = _Line(limit.name, value, limit.start)
-    return [bound for bound in ends.values() if math.isfinite(bound.value)]
+            if math.isfinite(value):
+                lines[value, limit.start, limit.stop] = _Line(limit.name, value, limit.start)
+    return list(lines.values())
 
 
-def _values(sample: Period) -> tuple[float, ...]:
-    """Return what is plotted of a period, in the order of `_PLOTS`; angles at their largest."""
+class _Values(NamedTuple):
+    """What is plotted of a period, in the order of `_PLOTS`."""
+
+    x: float  # position error [m]
+    y: float
+    z: float
+    roll: float  # [deg]
+    pitch: float
+    tilt: float
+    yaw_error: float
+    speed_1: float  # [rad/s]
+    speed_2: float
+    speed_3: float
+    speed_4: float
+    step: float  # [ms]
+
+
+def _values(sample: Period) -> _Values:
+    """Return what is plotted of a period; angles at their largest."""
     observed = sample.observation
     _, x, y, _ = sample.attitude.T
     up = 1.0 - 2.0 * (x**2 + y**2)
     tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
     euler = quaternion_to_euler(sample.attitude)
-    roll, pitch = (math.degrees(max(angles, key=abs)) for angles in euler[:, :2].T.tolist())
-    error = observed.truth[[*POSITION]] - observed.reference[:3]
-    turned = math.degrees(wrapped(float(euler[-1, 2] - observed.reference[3])))
-    return (*error, roll, pitch, tilt, turned, *sample.speeds, 1e3 * sample.step_s)
+    roll = math.degrees(max(euler[:, 0].tolist(), key=abs))
+    pitch = math.degrees(max(euler[:, 1].tolist(), key=abs))
+    yaw_error = math.degrees(wrapped(float(euler[-1, 2] - observed.reference[3])))
+    x_error, y_error, z_error = observed.truth[[*POSITION]] - observed.reference[:3]
+    speed_1, speed_2, speed_3, speed_4 = sample.speeds
+    return _Values(
+        x=x_error,
+        y=y_error,
+        z=z_error,
+        roll=roll,
+        pitch=pitch,
+        tilt=tilt,
+        yaw_error=yaw_error,
+        speed_1=speed_1,
+        speed_2=speed_2,
+        speed_3=speed_3,
+        speed_4=speed_4,
+        step=1e3 * sample.step_s,
+    )
 
 
 @contextlib.contextmanager

@@ -7,19 +7,22 @@ from collections.abc import Collection, Sequence
 from html import escape
 from typing import Final
 
-from quadsim.controller import OPTIMAL
+from quadsim.controller import OPTIMAL, Command
 from quadsim.features.live.session import Frame
 from quadsim.flight.audit import Limit
 from quadsim.palette import COLOUR, line_colour
+from quadsim.report.table import signed_number
 
 NEAR: Final = 0.1  # share of a bound's half band within which the row is marked
-_SHOWN: Final = 1.2  # bounds to the right end of a bar: what is beyond the bound shows too
+_FULL_BAR: Final = 1.2  # shares of a bound that a whole bar stands for: what is beyond the bound shows too
 HINTS: Final = {
     "pull": "<b>Drag the drone</b> to pull it",
     "waypoint": '<b><span class="mouse">Shift-click</span><span class="touch">Tap</span> the floor</b> to fly there',
     "break": "<b>Break a rotor</b> with the button in the panel",
 }
 
+NOT_DRIVING: Final = ("You watch", "Another page has the controls: Take the controls changes that.")
+"""Title and text of what a watcher is told who changes something."""
 WATCH: Final = (
     "<style>.mantine-Button-root:not([style*=orange]),.mantine-Slider-root,.mantine-Input-wrapper{opacity:.45}</style>"
     '<div class="q"><div class="watch">You watch; another page has the controls.</div></div>'
@@ -78,30 +81,26 @@ def says(text: str, mark: str = "") -> str:
 
 def hints(used: Collection[str], names: Sequence[str]) -> str:
     """Return the hints over the scene that have not been used, and the key to its colours."""
-    left = "".join(f"<div>{text}</div>" for name, text in HINTS.items() if name not in used)
-    key = "; ".join(map(_named, ("flown", "predicted", "reference"))) + "; arrows: thrusts; orange arm: front"
+    left = [f"<div>{text}</div>" for name, text in HINTS.items() if name not in used]
     if len(names) > 1:
-        key = "; ".join(f"{_dot(i)}{escape(name)}" for i, name in enumerate(names)) + "; inputs act on both"
-    return f'<div class="hints">{left}<div class="key">octahedron: set-point; {key}</div></div>'
+        vehicles = [f"{_dot(i)}{escape(name)}" for i, name in enumerate(names)]
+        key = "; ".join([*vehicles, "inputs act on both"])
+    else:
+        key = "; ".join([*map(_named, ("flown", "predicted", "reference")), "arrows: thrusts", "orange arm: front"])
+    return f'<div class="hints">{"".join(left)}<div class="key">octahedron: set-point; {key}</div></div>'
 
 
 def status_line(state: str, frame: Frame | None, factor: float) -> str:
-    """Return what the flight does now, its time and its speed."""
-    if frame is None:
-        time = ""
-    else:
-        time = f" <b>{frame.time:.2f} s</b>"
-    if frame is not None and state == "flying":
-        speed = f", real-time factor {factor:.2f}"
-    else:
-        speed = ""
+    """Return what the flight does now, its time and its speed; other than flying also where the panel is scrolled."""
     chip = f'<span class="chip {state}">{state}</span>'
-    # seen also where the panel is scrolled
-    if state == "flying":
-        over = ""
-    else:
-        over = f'<div class="over">{chip}</div>'
-    return block(f"{chip}{time}{speed}", "line") + over
+    text = chip
+    if frame is not None:
+        text += f" <b>{frame.time:.2f} s</b>"
+    if state != "flying":
+        return block(text, "line") + f'<div class="over">{chip}</div>'
+    if frame is not None:
+        text += f", real-time factor {factor:.2f}"
+    return block(text, "line")
 
 
 def readings(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lost: Collection[str] = ()) -> str:
@@ -109,40 +108,54 @@ def readings(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lo
 
     A state is tilt [deg] and position error [m].
     """
-    sample = None if frame is None else frame.samples[0]
-    if frame is None or sample is None:
+    if frame is None or frame.samples[0] is None:
         return block("&nbsp;", "line") * 4
-    command = sample.command
+    sample = frame.samples[0]
+    solved = f"solved in <b>{1e3 * sample.step_s:.1f}</b> ms"
     if sample.missed:
-        late = ' <span class="bad">late</span>'
-    else:
-        late = ""
-    solved = f"QP {escape(command.status)} by {escape(command.answered_by)}"
-    if command.status not in OPTIMAL or command.fallback:
-        solved = f'<span class="bad">QP {escape(command.status)}, fallback {command.fallback}</span>'
-    elif not command.stats.active:
-        solved = f"no bound active, by {escape(command.answered_by)}"
-    if command.stats.active:
-        active = f", {command.stats.active} bounds active"
-    else:
-        active = ""
-    weak = [f"rotor {i}: {100 * (share - 1):.0f} %" for i, share in enumerate(frame.health, 1) if share < 1.0]
+        solved += f" {_bad('late')}"
+    solved += f"; pull <b>{math.hypot(*frame.pull):.1f}</b> N"
+    for rotor, share in enumerate(frame.health, 1):
+        if share < 1.0:
+            solved += f"; {_bad(f'rotor {rotor}: {100 * (share - 1):.0f} %')}"
+    tilts = [f"{tilt:.1f}" for tilt, _ in states]
+    errors = [f"{error:.2f}" for _, error in states]
     rows = [
-        f"MPC: {solved}{active}",
-        f"solved in <b>{1e3 * sample.step_s:.1f}</b> ms{late}; pull <b>{math.hypot(*frame.pull):.1f}</b> N"
-        + "".join(f'; <span class="bad">{text}</span>' for text in weak),
-        f"tilt {_dotted([f'{tilt:.1f}' for tilt, _ in states])} deg",
-        f"position error {_dotted([f'{error:.2f}' for _, error in states])} m",
-        *(f'<span class="bad">{escape(text)}</span>' for text in lost),
+        f"MPC: {_answer(sample.command)}",
+        solved,
+        f"tilt {_by_vehicle(tilts)} deg",
+        f"position error {_by_vehicle(errors)} m",
     ]
+    rows += [_bad(escape(reason)) for reason in lost]
     return "".join(block(row, "line") for row in rows)
 
 
-def _dotted(texts: Sequence[str]) -> str:
-    return " ".join(f"{_dot(i) if len(texts) > 1 else ''}<b>{text}</b>" for i, text in enumerate(texts))
+def _answer(command: Command) -> str:
+    """Return what the controller answered."""
+    if command.status not in OPTIMAL or command.fallback:
+        answer = _bad(f"QP {escape(command.status)}, fallback {command.fallback}")
+    elif command.stats.active:
+        answer = f"QP {escape(command.status)} by {escape(command.answered_by)}"
+    else:
+        answer = f"no bound active, by {escape(command.answered_by)}"
+    if command.stats.active:
+        answer += f", {command.stats.active} bounds active"
+    return answer
+
+
+def _bad(text: str) -> str:
+    return f'<span class="bad">{text}</span>'
+
+
+def _by_vehicle(values: Sequence[str]) -> str:
+    """Return a value of each vehicle, of several behind a dot in its colour."""
+    if len(values) == 1:
+        return f"<b>{values[0]}</b>"
+    return " ".join(f"{_dot(i)}<b>{value}</b>" for i, value in enumerate(values))
 
 
 def _named(meaning: str) -> str:
+    """Return the meaning of a colour of the palette, behind a dot in it."""
     return f'<span style="color:{getattr(COLOUR, meaning)}">●</span> {meaning}'
 
 
@@ -170,38 +183,43 @@ class Constraints:
 
     def rows(self, frame: Frame, audited: Collection[str]) -> str:
         """Return the table; `audited` names the limits that still apply."""
-        both = len(frame.margins) > 1
-        if both:
+        if not self._limits:
+            return ""
+        titles = ["margin", "worst"]
+        if len(frame.margins) > 1:
             titles = [f"{_dot(0)}worst", f"{_dot(1)}worst"]
-        else:
-            titles = ["margin", "worst"]
-        heads = "".join(f'<th class="n" style="width:22%">{title}' for title in titles)
-        head = f'<tr><th style="width:30%">constraint<th>utilisation{heads}'
-        rows = [self._row(limit, limit.name in audited, frame) for limit in self._limits]
-        if rows:
-            return block(f"<table>{head}{''.join(rows)}</table>")
-        return ""
+        table = '<tr><th style="width:30%">constraint<th>utilisation'
+        for title in titles:
+            table += f'<th class="n" style="width:22%">{title}'
+        for limit in self._limits:
+            table += self._row(limit, limit.name in audited, frame)
+        return block(f"<table>{table}</table>")
 
     def _row(self, limit: Limit, audited: bool, frame: Frame) -> str:
-        margins = [margins.get(limit.name, math.nan) for margins in frame.margins]
-        marks = "".join(_mark(limit, margin, i) for i, margin in enumerate(margins) if not math.isnan(margin))
+        margins = [margins_by_name.get(limit.name, math.nan) for margins_by_name in frame.margins]
         worst = [self._worst.get((limit.name, i), math.nan) for i in range(len(margins))]
-        if margins[0] <= NEAR * limit.half_band:
-            kind = "near"
-        else:
-            kind = ""
-        cells = [_number(limit, margin) for margin in (worst if len(margins) > 1 else [margins[0], *worst])]
+        cells = [_number(limit, margin) for margin in worst]
+        if len(margins) == 1:
+            cells.insert(0, _number(limit, margins[0]))
+        kind = ""
         if math.isnan(margins[0]):
             kind = "off"
             if audited and frame.time < limit.start:
                 cells[0] = f"from {limit.start:g} s"
             else:
                 cells[0] = "ended"
-        bound = f'<i style="left:{100.0 / _SHOWN:.1f}%;width:2px;background:{COLOUR.bound}"></i>'
-        numbers = "".join(f'<td class="n">{cell}</td>' for cell in cells)
+        elif margins[0] <= NEAR * limit.half_band:
+            kind = "near"
+        track = ""
+        for i, margin in enumerate(margins):
+            if not math.isnan(margin):
+                track += _mark(limit, margin, i)
+        track += f'<i style="left:{100.0 / _FULL_BAR:.1f}%;width:2px;background:{COLOUR.bound}"></i>'
         name = f"{escape(limit.name)} [{escape(limit.unit)}]"
-        track = f'<div class="track">{marks}{bound}</div>'
-        return f'<tr class="{kind}"><td title="{name}">{name}</td><td>{track}</td>{numbers}</tr>'
+        row = f'<tr class="{kind}"><td title="{name}">{name}</td><td><div class="track">{track}</div></td>'
+        for cell in cells:
+            row += f'<td class="n">{cell}</td>'
+        return f"{row}</tr>"
 
 
 def _number(limit: Limit, margin: float) -> str:
@@ -209,7 +227,7 @@ def _number(limit: Limit, margin: float) -> str:
     if math.isnan(margin):
         return ""
     decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
-    text = f"{round(margin, decimals) + 0.0:+.{decimals}f}"
+    text = signed_number(margin, decimals)
     if limit.violated(margin):
         return f'<span class="bad" title="violated">{text}</span>'
     return text
@@ -217,7 +235,7 @@ def _number(limit: Limit, margin: float) -> str:
 
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     """Return a vehicle's mark: the first one's bar grows towards the bound, the other's is a stroke at its end."""
-    share = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN
+    share = min(max(1.0 - margin / limit.half_band, 0.0), _FULL_BAR) / _FULL_BAR
     colour = line_colour(vehicle)
     if vehicle:
         return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'

@@ -18,8 +18,9 @@ from quadsim.console.progress import reporting
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Document
 from quadsim.errors import MissingPackageError, ParameterError
 from quadsim.features.live.guard import LOOPBACK
+from quadsim.features.live.inputs import read_script
 from quadsim.features.live.pace import Pace
-from quadsim.features.live.session import Session, read_script
+from quadsim.features.live.session import Session
 from quadsim.interrupts import SignalHold
 from quadsim.mpc.laws import law_name
 from quadsim.outputs import run_directory
@@ -46,32 +47,23 @@ def fly_live(
     The other arguments are those of `quadsim.features.live.commands.live`; `place` is the port, the host and the
     browser.
     """
-    inputs = None if script is None else read_script(script)
-    if inputs is None:
+    inputs = None
+    if script is None:
         _require_server(place["host"], place["port"])
+    else:
+        inputs = read_script(script)
     with (
         run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
         SignalHold() as hold,
     ):
-        replaced = overwrite
+        saving = _Saving(directory, overwrite=overwrite, video=video)
         refused = list[str]()
-        one = threading.Lock()
-        saved: Flight | None = None
-
-        def save(flight: Flight) -> str:
-            nonlocal replaced, saved
-            products = {"video": video, "recording": None, "figures": None}
-            with one:  # one at a time
-                saved = write_run(flight, directory, products, overwrite=replaced, progress=True, flown=None)
-                replaced = True  # the next time it is this session's own
-            return console.short_path(directory)
-
         try:
             while onward and session.reason is None and session.k < scenario.periods:
                 session.advance()
             if inputs is None:
-                _serve(session, save, **place)
+                _serve(session, saving.save, **place)
             else:
                 with reporting(True, "the flight") as report:
                     refused = session.play(inputs, report)
@@ -82,17 +74,46 @@ def fly_live(
         finally:  # what was flown is saved, whatever ended it
             hold.flown = True
             if session.k:
-                save(session.flight())
+                saving.save(session.flight())
         text = ""
-        seconds = session.k * session.period
-        if saved is not None:
-            text = "".join(f"{line}\n" for line in (next(iter(saved.shown())), *saved.outputs()))
-        if session.reason is None and not refused:
-            status = EXIT_DONE
-        else:
+        if saving.saved is not None:
+            outcome = next(iter(saving.saved.shown()))
+            for line in (outcome, *saving.saved.outputs()):
+                text += f"{line}\n"
+        facts = {
+            "directory": str(directory),
+            "duration": session.k * session.period,
+            "reason": session.reason,
+            "refused": refused,
+        }
+        status = EXIT_DONE
+        if session.reason is not None or refused:
             status = EXIT_FAILED
-        facts = {"directory": str(directory), "duration": seconds, "reason": session.reason, "refused": refused}
         return Document(text, facts, status)
+
+
+class _Saving:
+    """The run directory of a session, written anew each time that its flight is saved.
+
+    Attributes:
+        saved: the flight as it was saved last; None before.
+    """
+
+    def __init__(self, directory: Path, *, overwrite: bool, video: bool) -> None:
+        self._directory = directory
+        self._overwrite = overwrite
+        self._products = {"video": video, "recording": None, "figures": None}
+        self._lock = threading.Lock()
+        self.saved: Flight | None = None
+
+    def save(self, flight: Flight) -> str:
+        """Write a flight, one at a time; return where."""
+        with self._lock:
+            self.saved = write_run(
+                flight, self._directory, self._products, overwrite=self._overwrite, progress=True, flown=None
+            )
+            self._overwrite = True  # the next time it is this session's own
+        return console.short_path(self._directory)
 
 
 def _require_server(host: str, port: int) -> None:
@@ -101,11 +122,10 @@ def _require_server(host: str, port: int) -> None:
         raise MissingPackageError("quadsim live", "viser", extra="live")
     if not 0 <= port <= 65535:
         raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
+    family = socket.AF_INET
+    if ":" in host:
+        family = socket.AF_INET6
     try:
-        if ":" in host:
-            family = socket.AF_INET6
-        else:
-            family = socket.AF_INET
         socket.create_server((host or "?", port), family=family).close()
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
@@ -114,7 +134,7 @@ def _require_server(host: str, port: int) -> None:
 
 
 def _serve(session: Session, save: Callable[[Flight], str], *, host: str, port: int, browser: bool) -> None:
-    """Show the page and fly until Ctrl-C; controllers of the library for the same vehicle and period may take over."""
+    """Show the page and fly until Ctrl-C."""
     from quadsim.features.live.page import Page
 
     if host not in LOOPBACK:
@@ -122,16 +142,23 @@ def _serve(session: Session, save: Callable[[Flight], str], *, host: str, port: 
             f"listening on {host}: anyone on that network with the address below can fly this session; "
             "the connection is not encrypted"
         )
-    scenario = session.scenario
-    others = dict[str, AnyController]()
-    for name in scenario_names():
-        other = load_scenario(name)
-        same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)
-        if same and other.controller not in [*others.values(), scenario.controller]:
-            others[f"{name} ({law_name(other.controller.type)})"] = other.controller
+    others = _other_controllers(session.scenario)
     pace = Pace(waiting=True)
     with closing(Page(session, pace, save=save, host=host, port=port, others=others)) as page:
         print(f"Open {page.address}  (Ctrl-C ends the session and saves it)", flush=True)
         if browser:
             webbrowser.open(page.address)
         pace.drive(session, page)
+
+
+def _other_controllers(scenario: Scenario) -> dict[str, AnyController]:
+    """Return the library's controllers for the same vehicle and period, which may take over, by name."""
+    known = [scenario.controller]
+    others = dict[str, AnyController]()
+    for name in scenario_names():
+        other = load_scenario(name)
+        is_alike = other.vehicle == scenario.vehicle and other.control_period == scenario.control_period
+        if is_alike and other.controller not in known:
+            known.append(other.controller)
+            others[f"{name} ({law_name(other.controller.type)})"] = other.controller
+    return others

@@ -11,25 +11,21 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Le, doc
-from pydantic import Field
 
-from quadsim.assets import read_toml
 from quadsim.console.progress import Progress, silent
 from quadsim.controller import Predicting
 from quadsim.errors import FlightError, InputError, ParameterError
-from quadsim.fields import FLOORS, Fraction, Vector
+from quadsim.features.live.inputs import HELD, HeldInput, Pull, Script, Steer, Wear, without_time
+from quadsim.fields import Vector
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.rollout.flight_events import Successor
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly, preferring_core
 from quadsim.scenarios.schema.controllers import AnyController
-from quadsim.scenarios.schema.events import Event
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.effects.load import Load, MassChange
@@ -37,60 +33,10 @@ from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, WindChange
 from quadsim.sim.physics import Period
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
-from quadsim.vehicle import span
+from quadsim.vehicle import Vehicle, span
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
 STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
-HELD: Final = ("pull", "wear", "steer")  # inputs in force until they are changed; the others are events
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pull:
-    """A spring from the vehicle to a point in the world, active until released."""
-
-    type: Literal["pull"]
-    to: Annotated[Vector | None, doc("[m] world; absent to let go")] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wear:
-    """A rotor's loss of thrust, held."""
-
-    type: Literal["wear"]
-    rotor: Annotated[int, Ge(1), Le(4)]
-    loss: Fraction
-
-
-@dataclass(frozen=True, kw_only=True)
-class Steer:
-    """The set-point's velocity, held."""
-
-    type: Literal["steer"]
-    velocity: Annotated[Vector, doc("[m/s]")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Held:
-    input: Annotated[Pull | Wear | Steer, Field(discriminator="type")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Declared:
-    inputs: list[Annotated[Event | Pull | Wear | Steer, Field(discriminator="type")]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Script:
-    """A session without a browser: inputs as `Session.submit` takes them, and the times [s] at which they are given."""
-
-    duration: Annotated[float, Ge(FLOORS["s"]), Le(36_000.0), doc("[s] of the session")]
-    inputs: list[dict[str, Any]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        for i, entry in enumerate(self.inputs):
-            at = entry.get("at")
-            if not isinstance(at, int | float) or isinstance(at, bool) or not 0.0 <= at < self.duration:
-                raise ParameterError("", f"inputs.{i}.at", at, f"below duration = {self.duration} s, and 0 or more")
 
 
 @dataclass(frozen=True)
@@ -118,8 +64,17 @@ class Disturbances:
     loss: Array  # (4,) the same with what `Wear` holds
 
 
+class _Queued(NamedTuple):
+    """An input that has not acted yet."""
+
+    table: Mapping[str, Any]
+    subject: str  # a later input of the same subject replaces it; empty for none
+    successor: Successor | None  # the controller that it lets take over
+    name: str  # how its refusal begins
+
+
 @dataclass
-class _Hand:
+class _HeldInputs:
     """Inputs in force until they are changed."""
 
     pull: Array | None = None  # (3,) to where [m]
@@ -140,13 +95,10 @@ class Session:
         self.scenario = looping(preferring_core(scenario))
         self._against = against
         self._effects = Assembly(self.scenario).effects
-        repeat = self.scenario.reference.repeat
-        # periods until the course starts again
-        if repeat is None:
-            self._round = None
-        else:
-            self._round = round(repeat / self.period)
-        self._queue: deque[tuple[Mapping[str, Any], str, Successor | None, str]] = deque()
+        self._round: int | None = None  # periods until the course starts again
+        if self.scenario.reference.repeat is not None:
+            self._round = round(self.scenario.reference.repeat / self.period)
+        self._queue: deque[_Queued] = deque()
         self.flights: tuple[Rollout, ...] = ()
         self.reset()
 
@@ -158,8 +110,8 @@ class Session:
         if self._against is not None:
             flown.append(Assembly(self.scenario).with_bounds.altered(controller=self._against))
         self.flights = tuple(Rollout(scenario, live=True) for scenario in flown)
-        self._held = _Hand()
-        self._steered = False
+        self._held = _HeldInputs()
+        self._steered = False  # whether an input has given a set-point
         self.reason: str | None = None
 
     def close(self) -> None:
@@ -186,27 +138,28 @@ class Session:
     def disturbances(self) -> Disturbances:
         """What acts now; after `reset`, what the scenario starts with."""
         flight = self.flights[0]
-        effects = self._effects
-        air = effects.air or Air()
-        load = effects.load or Load()
-        rotors = effects.rotors or RotorDynamics()
-        wind = air.wind
-        factor = load.mass_factor
+        wind = (self._effects.air or Air()).wind
+        factor = (self._effects.load or Load()).mass_factor
+        rotors = self._effects.rotors or RotorDynamics()
         lag = (rotors.rise or 0.0, rotors.fall or 0.0)
         changes = []
         for event in flight.scenario.events:
-            if isinstance(event, WindChange | MassChange | LagChange):
+            if isinstance(event, WindChange | MassChange | LagChange) and event.at <= flight.loop.time + 1e-9:
                 changes.append(event)
         for change in sorted(changes, key=lambda change: change.at):
-            match change if change.at <= flight.loop.time + 1e-9 else None:
-                case WindChange(velocity=velocity):
-                    wind = velocity
-                case MassChange(factor=other):
-                    factor = other
-                case LagChange(rise=rise, fall=fall):
-                    lag = rise, rise if fall is None else fall
-        worn = 1.0 - self._left()
-        return Disturbances(wind=wind, mass_factor=factor, lag=lag, worn=worn, loss=1.0 - self._left(by_hand=True))
+            match change:
+                case WindChange():
+                    wind = change.velocity
+                case MassChange():
+                    factor = change.factor
+                case LagChange():
+                    fall = change.fall
+                    if fall is None:
+                        fall = change.rise
+                    lag = (change.rise, fall)
+        worn = 1.0 - self._thrust_left()
+        loss = 1.0 - self._thrust_left(with_held=True)
+        return Disturbances(wind=wind, mass_factor=factor, lag=lag, worn=worn, loss=loss)
 
     def submit(
         self, table: Mapping[str, Any], *, subject: str = "", successor: Successor | None = None, name: str = ""
@@ -215,7 +168,7 @@ class Session:
 
         An earlier input of the same subject that has not acted yet is dropped.  A refusal begins with the name.
         """
-        self._queue.append((dict(table), subject, successor, name))
+        self._queue.append(_Queued(dict(table), subject, successor, name))
 
     def advance(self) -> Frame:
         """Fly one control period.
@@ -225,34 +178,55 @@ class Session:
         """
         if self.reason is not None:
             raise InputError(f"the flight has ended: {self.reason}")
-        refused: list[str] = []
-        taken = [self._queue.popleft() for _ in range(len(self._queue))]
-        last = {subject: i for i, (_, subject, *_) in enumerate(taken)}
-        for i, (table, subject, successor, name) in enumerate(taken):
-            if not subject or last[subject] == i:
-                try:
-                    self._apply(table, successor)
-                except InputError as error:
-                    refused.append(f"{name}{error}")
+        refused = self._apply_queued()
         if not self._steered and self.k == self._round:  # an arrival, say, was one at the end of the first round
             for flight in self.flights:
                 flight.leave_course()
-        pull = self._hold(refused)
-        shown = []
+        pull = self._apply_held(refused)
+        samples: list[Period | None] = []
+        margins: list[Mapping[str, float]] = []
+        horizons: list[Array | None] = []
         for flight in self.flights:
-            entry: tuple[Period | None, Mapping[str, float], Array | None] = None, {}, None
-            if flight.loop.reason is None:
-                try:
-                    sample = flight.step()
-                    entry = sample, flight.margins(sample), _horizon(flight, sample)
-                except FlightError as error:
-                    if flight is self.flights[0]:
-                        self.reason = str(error)
-            shown.append(entry)
-        samples, margins, horizons = zip(*shown, strict=True)
-        health = self._left(by_hand=True)
-        time = round((self.k - 1) * self.period, 9)
-        return Frame(self.k - 1, time, samples, margins, horizons, pull, health, tuple(refused))
+            sample, margins_by_name, horizon = self._step(flight)
+            samples.append(sample)
+            margins.append(margins_by_name)
+            horizons.append(horizon)
+        return Frame(
+            k=self.k - 1,
+            time=round((self.k - 1) * self.period, 9),
+            samples=tuple(samples),
+            margins=tuple(margins),
+            horizons=tuple(horizons),
+            pull=pull,
+            health=self._thrust_left(with_held=True),
+            refused=tuple(refused),
+        )
+
+    def _apply_queued(self) -> list[str]:
+        """Apply the inputs given since the last period, of each subject the last one; return why some were refused."""
+        refused: list[str] = []
+        taken = [self._queue.popleft() for _ in range(len(self._queue))]
+        last_of_subject = {entry.subject: i for i, entry in enumerate(taken)}
+        for i, entry in enumerate(taken):
+            if entry.subject and last_of_subject[entry.subject] != i:
+                continue
+            try:
+                self._apply(entry.table, entry.successor)
+            except InputError as error:
+                refused.append(f"{entry.name}{error}")
+        return refused
+
+    def _step(self, flight: Rollout) -> tuple[Period | None, Mapping[str, float], Array | None]:
+        """Fly a period of a flight; return it with margins and prediction, nothing of a flight that has ended."""
+        if flight.loop.reason is not None:
+            return None, {}, None
+        try:
+            sample = flight.step()
+            return sample, flight.margins(sample), _horizon(flight, sample)
+        except FlightError as error:
+            if flight is self.flights[0]:
+                self.reason = str(error)
+            return None, {}, None
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """Build a controller for the first flight with some fields changed; callable from any thread.
@@ -263,19 +237,17 @@ class Session:
         flight = self.flights[0]
         result = flight.successor(fields)
         for signal, (lower, upper) in result.spec.audited(flight.vehicle).items():
-            if signal == "speed":
-                hover = flight.vehicle.hover_speeds
-            elif signal == "thrust":
-                hover = np.array([flight.vehicle.mass * flight.vehicle.gravity])
+            if signal in REFERENCE_NAMES:
+                continue
+            hover = _in_hover(signal, flight.vehicle)
+            if lower <= hover.min() and hover.max() <= upper:
+                continue
+            if signal in COMMAND_SIGNALS:
+                table = "input_bounds"
             else:
-                hover = np.zeros(1)
-            if signal not in REFERENCE_NAMES and not (lower <= hover.min() and hover.max() <= upper):
-                if signal in COMMAND_SIGNALS:
-                    table = "input_bounds"
-                else:
-                    table = "output_bounds"
-                rule = f"a range that contains {span(hover)}, as in hover"
-                raise ParameterError(f"controller.{table}", signal, [lower, upper], rule)
+                table = "output_bounds"
+            rule = f"a range that contains {span(hover)}, as in hover"
+            raise ParameterError(f"controller.{table}", signal, [lower, upper], rule)
         return result
 
     def refusals(self, tables: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -297,12 +269,14 @@ class Session:
         """
         refused: list[str] = []
         waiting = deque(sorted(enumerate(script.inputs), key=lambda entry: float(entry[1]["at"])))
-        while self.reason is None and (time := self.k * self.period) < script.duration - 1e-9:
+        while self.reason is None:
+            time = self.k * self.period
+            if time >= script.duration - 1e-9:
+                break
             progress("session", self.k, round(script.duration / self.period))
             while waiting and waiting[0][1]["at"] <= time + 1e-9:
                 i, entry = waiting.popleft()
-                table = {key: value for key, value in entry.items() if key != "at"}
-                self.submit(table, name=f"inputs.{i} at t = {time:.3f} s: ")
+                self.submit(without_time(entry), name=f"inputs.{i} at t = {time:.3f} s: ")
             refused += self.advance().refused
         return refused
 
@@ -318,72 +292,92 @@ class Session:
 
     def _apply(self, table: Mapping[str, Any], successor: Successor | None) -> None:
         """Apply an input; a controller event only to the first flight."""
-        if table.get("type") in HELD:
-            match parse_table(_Held, {"input": table}, "input").input:
-                case Pull(to=to):
-                    self._held.pull = None if to is None else np.array(to)
-                case Wear(rotor=rotor, loss=loss):
-                    self._held.wear[rotor] = loss
-                case Steer(velocity=velocity):
-                    self._held.steer = np.array(velocity)
-        elif table.get("type") == "controller":
+        kind = table.get("type")
+        if kind in HELD:
+            self._hold(parse_table(HeldInput, {"input": table}, "input").input)
+        elif kind == "controller":
             self.flights[0].apply(table, successor)
         else:
-            if table.get("type") == "setpoint":
+            if kind == "setpoint":
                 self._held.setpoint = None
-            self._happen(table)
+            self._apply_event(table)
 
-    def _happen(self, event: Mapping[str, Any]) -> None:
+    def _hold(self, held: Pull | Wear | Steer) -> None:
+        """Hold an input in force."""
+        match held:
+            case Pull(to=None):
+                self._held.pull = None
+            case Pull(to=to):
+                self._held.pull = np.array(to)
+            case Wear(rotor=rotor, loss=loss):
+                self._held.wear[rotor] = loss
+            case Steer(velocity=velocity):
+                self._held.steer = np.array(velocity)
+
+    def _apply_event(self, event: Mapping[str, Any]) -> None:
+        """Apply an event to all flights that have not ended; with the first set-point they leave the course."""
+        is_setpoint = event.get("type") == "setpoint"
         for flight in self.flights:
             if flight.loop.reason is None:
                 flight.apply(event)
-                if event.get("type") == "setpoint" and not self._steered:
+                if is_setpoint and not self._steered:
                     flight.leave_course()
-        self._steered |= event.get("type") == "setpoint"
+        if is_setpoint:
+            self._steered = True
 
-    def _left(self, *, by_hand: bool = False) -> Array:
-        """Return the share of its thrust that each rotor has left (4,) by the scenario, or with the person's `Wear`."""
+    def _thrust_left(self, *, with_held: bool = False) -> Array:
+        """Return the share of its thrust that each rotor has left (4,) by the scenario, or also by `Wear` in force."""
         now = self.flights[0].loop.time + 1e-9
         left = np.array((self._effects.rotors or RotorDynamics()).efficiency)
         for event in self.scenario.events:
             if isinstance(event, RotorLoss) and event.at <= now < event.at + (event.duration or math.inf):
                 left[event.rotor - 1] *= 1.0 - event.loss
-        for rotor, loss in self._held.wear.items() if by_hand else ():
-            left[rotor - 1] *= 1.0 - loss
+        if with_held:
+            for rotor, loss in self._held.wear.items():
+                left[rotor - 1] *= 1.0 - loss
         return left
 
-    def _hold(self, refused: list[str]) -> Array:
+    def _apply_held(self, refused: list[str]) -> Array:
         """Apply the inputs in force for one more period; return the force of the pull (3,) [N]."""
-        held = self._held
-        force = np.zeros(3)
         last = self.flights[0].loop.last
         if last is None:  # where the vehicle is shows once a period has been flown
-            return force
+            return np.zeros(3)
+        force = self._pull_force(last)
         events: list[dict[str, Any]] = []
-        if held.pull is not None:
-            weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
-            force = STIFFNESS * weight * (held.pull - last.position[-1])
-            force *= min(1.0, STRONGEST * weight / max(float(np.linalg.norm(force)), 1e-9))
-            force = np.round(force, 3)  # [N]
-            if force.any():
-                events.append({"type": "push", "duration": self.period, "force": force.tolist()})
-        worn = {"type": "rotor_loss", "duration": self.period}
-        events += [worn | {"rotor": rotor, "loss": loss} for rotor, loss in sorted(held.wear.items()) if loss > 0.0]
-        if held.steer.any():
-            if held.setpoint is None:
-                at = last.observation.reference[:3]
-            else:
-                at = held.setpoint
-            held.setpoint = np.round(at + self.period * held.steer, 6)
-            events.append({"type": "setpoint", **dict(zip("xyz", held.setpoint.tolist(), strict=True))})
+        if force.any():
+            events.append({"type": "push", "duration": self.period, "force": force.tolist()})
+        for rotor, loss in sorted(self._held.wear.items()):
+            if loss > 0.0:
+                events.append({"type": "rotor_loss", "duration": self.period, "rotor": rotor, "loss": loss})
+        if self._held.steer.any():
+            x, y, z = self._steered_setpoint(last).tolist()
+            events.append({"type": "setpoint", "x": x, "y": y, "z": z})
         try:
             for event in events:
-                self._happen(event)
+                self._apply_event(event)
         except InputError as error:  # as where a scenario is full of events
             refused.append(f"{error}; all is let go")
-            self._held = _Hand()
+            self._held = _HeldInputs()
             return np.zeros(3)
         return force
+
+    def _pull_force(self, last: Period) -> Array:
+        """Return the force (3,) [N] of the spring that a person pulls by, after a period; zero without one."""
+        if self._held.pull is None:
+            return np.zeros(3)
+        weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
+        force = STIFFNESS * weight * (self._held.pull - last.position[-1])
+        force *= min(1.0, STRONGEST * weight / max(float(np.linalg.norm(force)), 1e-9))
+        return np.round(force, 3)
+
+    def _steered_setpoint(self, last: Period) -> Array:
+        """Move the set-point (3,) [m] by a period of steering, from where it is after a period; return it."""
+        start = self._held.setpoint
+        if start is None:
+            start = last.observation.reference[:3]
+        setpoint = np.round(start + self.period * self._held.steer, 6)
+        self._held.setpoint = setpoint
+        return setpoint
 
 
 def looping(scenario: Scenario) -> Scenario:
@@ -392,13 +386,14 @@ def looping(scenario: Scenario) -> Scenario:
     Courses that never end, do not move, or state velocities stay as they are.
     """
     course = Assembly(scenario).course
+    if scenario.reference.repeat is not None or course.derivatives is not None:
+        return scenario
     period = scenario.control_period
-    moves = bool(np.ptp(course.sample(period * np.arange(scenario.periods + 1, dtype=np.float64)), axis=0).any())
-    if math.isinf(course.end):
+    references = course.sample(period * np.arange(scenario.periods + 1, dtype=np.float64))
+    end = course.end
+    if math.isinf(end):
         end = max((scenario.duration, *course.jumps, *course.kinks))
-    else:
-        end = course.end
-    if scenario.reference.repeat is not None or course.derivatives is not None or not moves or math.isinf(end):
+    if not np.ptp(references, axis=0).any() or math.isinf(end):
         return scenario
     length = round(period * math.ceil(max(scenario.duration, end) / period - 1e-6), 9)
     reference = copy.copy(scenario.reference)  # with the content that a table may have in memory
@@ -406,21 +401,17 @@ def looping(scenario: Scenario) -> Scenario:
     return scenario.altered(reference=reference)
 
 
-def read_script(path: str | Path) -> Script:
-    """Read a script.
-
-    Raises:
-        InputError: it is malformed, or an input is wrong whatever the scenario.
-    """
-    script = parse_table(Script, read_toml(Path(path)), str(path), file="script")
-    inputs = []
-    for entry in script.inputs:
-        inputs.append({k: v for k, v in entry.items() if k != "at" or entry.get("type") not in HELD})
-    parse_table(_Declared, {"inputs": inputs}, str(path), file="script")
-    return script
+def _in_hover(signal: str, vehicle: Vehicle) -> Array:
+    """Return the values of a signal in hover, in the unit of its bounds."""
+    if signal == "speed":
+        return vehicle.hover_speeds
+    if signal == "thrust":
+        return np.array([vehicle.mass * vehicle.gravity])
+    return np.zeros(1)
 
 
 def _horizon(flight: Rollout, sample: Period) -> Array | None:
+    """Return the predicted positions (N, 3) [m] from a period's end on; None without a prediction."""
     controller = flight.loop.controller
     state = sample.observation.state
     if not isinstance(controller, Predicting) or len(sample.command.plan) < 1:

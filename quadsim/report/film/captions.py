@@ -17,7 +17,7 @@ from quadsim.palette import ON_DARK
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Filmed, Footage, MarginTrack, ranked_tracks
 from quadsim.report.film.painter import Painter, Picture, shade, text_width
-from quadsim.report.table import ABSENT
+from quadsim.report.table import ABSENT, signed_number
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
@@ -36,7 +36,7 @@ _MOST_LINES: Final = 10  # of the statement at the end: more would reach the str
 _WIDEST: Final = 140  # letters of a line, between the frame's edge and the legend
 
 
-class Line(NamedTuple):
+class Caption(NamedTuple):
     """A line of text in the upper left corner."""
 
     text: str
@@ -102,52 +102,52 @@ class Overlay:
                 return limit
         return None
 
-    def _headlines(self, i: int) -> list[Line]:
+    def _headlines(self, i: int) -> list[Caption]:
         """The lines in the corner."""
         time = self._footage.times[i]
         clock = f"t = {time:.2f} s"
         if self._speed != 1.0:
             clock += f"   {self._speed:g} times real speed"
         lines = [
-            Line(self._run.name, 21, ink.WHITE),
-            Line(self._subtitle, 14, ink.GREY),
-            Line(clock, 20, ink.WHITE),
+            Caption(self._run.name, 21, ink.WHITE),
+            Caption(self._subtitle, 14, ink.GREY),
+            Caption(clock, 20, ink.WHITE),
             self._answer(self._footage.period[i]),
         ]
         if self._footage.wind is not None:
             wind = np.linalg.norm(self._footage.wind[i])
-            lines.append(Line(f"wind {wind:.2g} m/s", 14, ON_DARK.disturbance))
+            lines.append(Caption(f"wind {wind:.2g} m/s", 14, ON_DARK.disturbance))
         if self._footage.force is not None:
             force = np.linalg.norm(self._footage.force[i])
-            lines.append(Line(f"external force {force:.2g} N", 14, ON_DARK.disturbance))
+            lines.append(Caption(f"external force {force:.2g} N", 14, ON_DARK.disturbance))
         lines += self._recent_events(time)
         reason = self._run.log.reason
         if reason is not None and time >= self._run.log.control.t[-1]:
-            lines.append(Line(f"aborted {reason}"[:130], 15, ON_DARK.violated))
+            lines.append(Caption(f"aborted {reason}"[:130], 15, ON_DARK.violated))
         if time >= self._footage.times[-1] - _ENDING * self._speed:
             lines += self._failures()
         return lines
 
-    def _recent_events(self, time: float) -> list[Line]:
+    def _recent_events(self, time: float) -> list[Caption]:
         """The flight's events shortly before a time [s], the latest ones."""
         recent = []
         for event in self._run.events:
             if 0.0 <= time - event["time"] <= _EVENT_TIME * self._speed:
-                recent.append(Line(event["text"][:_WIDEST], 15, ON_DARK.warning))
+                recent.append(Caption(event["text"][:_WIDEST], 15, ON_DARK.warning))
         return recent[-_MOST_EVENTS:]
 
-    def _failures(self) -> list[Line]:
+    def _failures(self) -> list[Caption]:
         """What failed other than a constraint."""
         lines = []
         for sentence in self._run.failures:
             for part in textwrap.wrap(sentence, _WIDEST):
-                lines.append(Line(part, 14, ON_DARK.warning))
+                lines.append(Caption(part, 14, ON_DARK.warning))
         if len(lines) > _MOST_LINES:
-            rest = Line("... all of it is in summary.json", 14, ON_DARK.warning)
+            rest = Caption("... all of it is in summary.json", 14, ON_DARK.warning)
             return [*lines[:_MOST_LINES], rest]
         return lines
 
-    def _answer(self, k: int) -> Line:
+    def _answer(self, k: int) -> Caption:
         """Phase, where the flight has a ground, and what the controller answered in period k; red for a failure."""
         control = self._run.log.control
         status = control.status[k]
@@ -165,7 +165,7 @@ class Overlay:
         if control.iterations[k]:
             phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
         failed = fallback != 0 or status not in OPTIMAL | {Phase.LANDED}
-        return Line("  ·  ".join(phrases), 14, _red_if(failed, otherwise=ON_DARK.satisfied))
+        return Caption("  ·  ".join(phrases), 14, _red_if(failed, otherwise=ON_DARK.satisfied))
 
     def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x + 118, y, "now", size=13, colour=ink.GREY, anchor="ra")
@@ -177,24 +177,24 @@ class Overlay:
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             unit = "m"
             factor = 1.0
-            digits = 2
+            decimals = 2
             undefined = False
             if state == INDEX["yaw"]:
                 unit = "deg"
                 factor = math.degrees(1.0)
-                digits = 1
+                decimals = 1
                 undefined = tilt is not None and bool(tilt[i] > 0.5 * math.pi)  # there is no heading upside down
             now = factor * values[j]
             target = factor * reference[j]
-            shown = _signed(now, digits)
-            error = _signed(now - target, digits)
+            shown = signed_number(now, decimals)
+            error = signed_number(now - target, decimals)
             if undefined:
                 shown = ABSENT
                 error = ABSENT
             row = y + 24 + 27 * j
             painter.text(x, row, f"{name} [{unit}]", colour=ink.GREY)
             painter.text(x + 118, row, shown, colour=ink.WHITE, anchor="ra")
-            painter.text(x + 192, row, _signed(target, digits), colour=ON_DARK.reference, anchor="ra")
+            painter.text(x + 192, row, signed_number(target, decimals), colour=ON_DARK.reference, anchor="ra")
             painter.text(x + 262, row, error, colour=ink.GREY, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -218,7 +218,8 @@ class Overlay:
             span = 2.0 * max(map(abs, bounds), default=15.0)
         broken = _breaks(limit, value)
         painter.text(x, y, name, size=17)
-        painter.text(x + 262, y, _signed(value, 2), size=17, colour=_red_if(broken, otherwise=ink.WHITE), anchor="ra")
+        colour = _red_if(broken, otherwise=ink.WHITE)
+        painter.text(x + 262, y, signed_number(value, 2), size=17, colour=colour, anchor="ra")
         painter.box(x, y + 25, 262, 9, ink.FAINT)
         centre = x + 131
         unit = 131 / span
@@ -285,7 +286,7 @@ class Overlay:
             pitch = 18.5
         for j, track in enumerate(shown):
             row = y + 22 + pitch * j
-            worst = f"{_signed(track.worst[i], 2)} {track.limit.unit}"
+            worst = f"{signed_number(track.worst[i], 2)} {track.limit.unit}"
             name_colour = _red_if(track.violated[i], otherwise=ink.GREY)
             worst_colour = _red_if(track.violated_before[i], otherwise=ink.WHITE)
             painter.text(x, row, track.limit.name, size=14, colour=name_colour)
@@ -305,11 +306,6 @@ def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack
     if parts:
         rest = f"and {', '.join(parts)}"
     return begun[:_MOST_MARGINS], rest
-
-
-def _signed(value: float, digits: int) -> str:
-    """A number with its sign, but no "-0.00"."""
-    return f"{round(value, digits) + 0.0:+.{digits}f}"
 
 
 def _red_if(broken: object, *, otherwise: str) -> str:

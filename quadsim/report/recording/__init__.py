@@ -1,19 +1,4 @@
-"""A finished run -> a rerun recording that opens with its layout, and the viewer it opens in.
-
-Everything stands on one timeline, `sim_time`, the simulated time:
-
-    world/...           vehicle, thrusts, external force, wind, flown path, reference, and the horizon predicted at each
-                        control period of flight
-    signals/NAME        what can be limited, by the names and in the units of `quadsim.flight.audit.SIGNALS`; of
-                        flights that may turn upside down quaternion and body_rates as well
-    reference/NAME      what x, y, z and yaw should be
-    limits/NAME         the bounds, drawn with their signal
-    margins/NAME        signed distance to the nearer bound at the control samples; negative = beyond the bound
-    verdicts/NAME       its verdict: holds, active, violated
-    solver/NAME         what each step of the controller took and answered
-    effects/NAME        external force and torque, wind, commands that rotors do not follow at once; where there are any
-    events, summary     texts
-"""
+"""A finished run -> a rerun recording that opens with its layout, and the viewer it opens in."""
 
 from __future__ import annotations
 
@@ -47,6 +32,21 @@ _GRACE: Final = 2.0  # time that a viewer has to end by itself [s]
 
 def write_recording(run: FlightRecord, path: Path) -> None:
     """Write a run, completed or not, as a new `.rrd` with its layout inside; it appears complete or not at all.
+
+    Everything stands on one timeline, `sim_time`, the simulated time:
+
+        world/...           vehicle, thrusts, external force, wind, flown path, reference, and the horizon predicted at
+                            each control period of flight
+        signals/NAME        what can be limited, by the names and in the units of `quadsim.flight.audit.SIGNALS`; of
+                            flights that may turn upside down quaternion and body_rates as well
+        reference/NAME      what x, y, z and yaw should be
+        limits/NAME         the bounds, drawn with their signal
+        margins/NAME        signed distance to the nearer bound at the control samples; negative = beyond the bound
+        verdicts/NAME       its verdict: holds, active, violated
+        solver/NAME         what each step of the controller took and answered
+        effects/NAME        external force and torque, wind, commands that rotors do not follow at once; where there
+                            are any
+        events, summary     texts
 
     Raises:
         OutputError: the file cannot be written or is there already, or the environment switches rerun off.

@@ -20,9 +20,10 @@ from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.errors import InputError
 from quadsim.features.live.commands import live
+from quadsim.features.live.inputs import read_script
 from quadsim.features.live.knobs import knobs
 from quadsim.features.live.pace import LATE, Pace
-from quadsim.features.live.session import STRONGEST, Frame, Session, looping, read_script
+from quadsim.features.live.session import STRONGEST, Frame, Session, looping
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
