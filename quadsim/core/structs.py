@@ -30,7 +30,7 @@ class LoopKind(IntEnum):
 
 
 class Fate:
-    """What befalls a sensor's sample: a sum of these, as arrays of NumPy take them."""
+    """What happens to a sensor's sample: a sum of these, as arrays of NumPy take them."""
 
     LOST: Final = 1
     FROZEN: Final = 2

@@ -319,10 +319,10 @@ class ScenarioError(InputError):
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
-        unsaid = len(problems) - _MOST_LINES
+        not_listed = len(problems) - _MOST_LINES
         lines = [*problems[:_MOST_LINES]]
-        if unsaid > 0:
-            lines.append(f"and {unsaid} more")
+        if not_listed > 0:
+            lines.append(f"and {not_listed} more")
         super().__init__(f"{source}: " + "\n  ".join(lines))
         self.source = source
         self.problems = tuple(problems)
@@ -431,14 +431,14 @@ def describe_all(
     with_wrong_parts: set[tuple[str, ...]] = set()
     for names in wrong:
         with_wrong_parts |= _enclosing(names)
-    told = []
+    described = []
     for names, details in wrong.items():
         if lists_of_wrong_length & _enclosing(names):
             continue
         if names in lists_of_wrong_length or names not in with_wrong_parts:
-            told.append(details)
-    lines = [describe(details, data, root, file=file) for details in told[:_MOST_DESCRIBED]]
-    for details in told[_MOST_DESCRIBED:]:
+            described.append(details)
+    lines = [describe(details, data, root, file=file) for details in described[:_MOST_DESCRIBED]]
+    for details in described[_MOST_DESCRIBED:]:
         lines.append(".".join(map(str, details["loc"])))
     return lines
 
