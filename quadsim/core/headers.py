@@ -1,19 +1,8 @@
 """What the headers of quadsim's C declare: enumerators, structs and functions.
 
 The headers are the only declaration of these; Python's mirrors follow from it (`quadsim.core.mirror`), and so does the
-table of offsets that is compiled into the library (`layout_source`).
-
-What is read is C99 in a plain form, and anything else is a `HeaderError` that names the line:
-
-- `enum NAME { A, B = 1, C = A + 2 * B };`
-- `typedef struct NAME { ... } NAME;`, its members numbers, structs, arrays of these, and pointers, also to functions;
-- `typedef double NAME;`
-- prototypes of functions that take and return numbers and pointers.
-
-`static` definitions are left out, and code of macros that are not defined: `#ifdef`, `#ifndef` and `#else` decide, but
-no declaration may stand under `#if`.  A name means the same in all headers.
-
-This file needs only the standard library: `build.py` loads it where nothing of quadsim can be imported.
+table of offsets that is compiled into the library (`layout_source`).  This file needs only the standard library:
+`build.py` loads it where nothing of quadsim can be imported.
 """
 
 from __future__ import annotations
@@ -91,6 +80,17 @@ class Declarations(NamedTuple):
 
 def read_headers(files: Iterable[Path]) -> Declarations:
     """Read headers, and what these include of one another.
+
+    What is read is C99 in a plain form, and anything else is a `HeaderError` that names the line:
+
+    - `enum NAME { A, B = 1, C = A + 2 * B };`
+    - `typedef struct NAME { ... } NAME;`, its members numbers, structs, arrays of these, and pointers, also to
+      functions;
+    - `typedef double NAME;`
+    - prototypes of functions that take and return numbers and pointers.
+
+    `static` definitions are left out, and code of macros that are not defined: `#ifdef`, `#ifndef` and `#else` decide,
+    but no declaration may stand under `#if`.  A name means the same in all headers.
 
     Raises:
         HeaderError: one has something that cannot be mirrored.
