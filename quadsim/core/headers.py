@@ -238,26 +238,29 @@ class _File:
 
     def read(self) -> None:
         """Read all declarations."""
-        text = self._text
-        at = 0
-        while True:
-            at = self._after_space(at)
-            if at == len(text):
-                return
-            if found := _STATIC.match(text, at):
-                at = self._end_of_definition(at, found.end())
-                continue
-            if found := _ENUM.match(text, at):
-                self._enumerators(found.start(1), found[1])
-            elif found := _STRUCT.match(text, at):
-                self._struct(at, found)
-            elif found := _TYPEDEF.match(text, at):
-                self._typedef(at, found)
-            elif found := _FUNCTION.match(text, at):
-                self._function(at, found)
+        at = self._after_space(0)
+        while at < len(self._text):
+            definition = _STATIC.match(self._text, at)
+            if definition is not None:
+                at = self._end_of_definition(at, definition.end())
             else:
-                raise self._error(at, f"{self._shown(at)!r} is not known here; see quadsim/core/headers.py")
-            at = found.end()
+                at = self._read_declaration(at)
+            at = self._after_space(at)
+
+    def _read_declaration(self, at: int) -> int:
+        """Read the declaration at a place, of the first kind that it has the form of; returns its end."""
+        kinds = (
+            (_ENUM, self._enumerators),
+            (_STRUCT, self._struct),
+            (_TYPEDEF, self._typedef),
+            (_FUNCTION, self._function),
+        )
+        for pattern, read in kinds:
+            found = pattern.match(self._text, at)
+            if found is not None:
+                read(at, found)
+                return found.end()
+        raise self._error(at, f"{self._shown(at)!r} is not known here; see quadsim/core/headers.py")
 
     def _after_space(self, at: int) -> int:
         found = _SPACE.match(self._text, at)
@@ -278,10 +281,11 @@ class _File:
                 return brace.end()
         raise self._error(start, "this definition does not end")
 
-    def _enumerators(self, at: int, body: str) -> None:
-        """Define the enumerators between the braces of an enumeration."""
+    def _enumerators(self, at: int, found: re.Match[str]) -> None:
+        """Define the enumerators of an enumeration."""
         value = -1
-        for entry in body.split(","):
+        at = found.start(1)
+        for entry in found[1].split(","):
             name, _, stated = entry.partition("=")
             name = name.strip()
             if name:
