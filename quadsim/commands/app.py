@@ -311,13 +311,14 @@ def run(
     from quadsim.scenarios.feasibility_check import notes
 
     require_film(video, fps)
-    parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
+    assembly = loading.assemble(scenario, changes, seed)
+    assembly, law, acting_forces = user_code.set_up(assembly, controller, forces, reference)
     products = {"video": video, "recording": recording, "figures": figures}
-    for note in (*notes(parts[0]), *instability_notes(parts[0])):
+    for note in (*notes(assembly), *instability_notes(assembly)):
         _log.info(note)
-    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, SignalHold():
+    with run_directory(assembly.scenario.name, out, overwrite=overwrite) as directory, SignalHold():
         with reporting(progress, "the flight") as report:
-            flight = Rollout(*parts).fly(report)
+            flight = Rollout(assembly, law, acting_forces).fly(report)
         return write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)
 
 
@@ -357,8 +358,9 @@ def start(
     from quadsim.rollout.rollout import Rollout
     from quadsim.scenarios import loading, user_code
 
-    parts = user_code.set_up(loading.assemble(scenario), controller, forces, reference, autopilot)
-    return Rollout(*parts, live=live, recorded=recorded)
+    assembly = loading.assemble(scenario)
+    assembly, law, acting_forces = user_code.set_up(assembly, controller, forces, reference, autopilot)
+    return Rollout(assembly, law, acting_forces, live=live, recorded=recorded)
 
 
 def read(directory: str | Path) -> Flight:
@@ -422,36 +424,54 @@ def check(
         (True, ())
     """
     from quadsim.console.junit import junit_file, write_junit
-    from quadsim.console.progress import reporting
     from quadsim.console.results import after
-    from quadsim.rollout.flown import Check
-    from quadsim.rollout.reaudit import reaudit
-    from quadsim.rollout.rollout import Rollout
-    from quadsim.rollout.stability import instability_notes
-    from quadsim.scenarios import loading
     from quadsim.scenarios.catalogue import names_directory
-    from quadsim.scenarios.feasibility_check import leftover_notes
 
-    file = None if junit is None else junit_file(junit)
+    file = None
+    if junit is not None:
+        file = junit_file(junit)
     if isinstance(target, str | Path) and names_directory(target):
-        if changes or seed is not None:
-            option, value = ("--set", changes) if changes else ("--seed", seed)
-            raise ParameterError("", option, value, "absent when a finished run is checked")
-        if (owner := owner_of(Path(target))) is not None:
-            raise InputError(owner.check_advice(target))
-        audited = reaudit(Path(target))
-        for note in audited.notes:
-            _log.info("%s: %s", target, note)
+        if changes:
+            raise ParameterError("", "--set", changes, "absent when a finished run is checked")
+        if seed is not None:
+            raise ParameterError("", "--seed", seed, "absent when a finished run is checked")
+        audited = _check_run(target)
     else:
-        assembly = loading.assemble(target, changes, seed)
-        for note in (*leftover_notes(assembly), *instability_notes(assembly)):
-            _log.info(note)
-        with reporting(progress, "the flight") as report:
-            audited = replace(Rollout(assembly).fly(report), checked=Check())
+        audited = _check_scenario(target, changes, seed, progress)
     if file is not None:
         with after(audited, file):
             write_junit(audited, file)
     return audited
+
+
+def _check_run(directory: str | Path) -> Flight:
+    """Return a finished run, audited again from its tables."""
+    from quadsim.rollout.reaudit import reaudit
+
+    owner = owner_of(Path(directory))
+    if owner is not None:
+        raise InputError(owner.check_advice(directory))
+    flight = reaudit(Path(directory))
+    for note in flight.notes:
+        _log.info("%s: %s", directory, note)
+    return flight
+
+
+def _check_scenario(scenario: ScenarioName, changes: Changes, seed: Whole | None, progress: Watched) -> Flight:
+    """Return the audited flight of a scenario."""
+    from quadsim.console.progress import reporting
+    from quadsim.rollout.flown import Check
+    from quadsim.rollout.rollout import Rollout
+    from quadsim.rollout.stability import instability_notes
+    from quadsim.scenarios import loading
+    from quadsim.scenarios.feasibility_check import leftover_notes
+
+    assembly = loading.assemble(scenario, changes, seed)
+    for note in (*leftover_notes(assembly), *instability_notes(assembly)):
+        _log.info(note)
+    with reporting(progress, "the flight") as report:
+        flight = Rollout(assembly).fly(report)
+    return replace(flight, checked=Check())
 
 
 @app.command(
@@ -514,19 +534,16 @@ def compare(
 
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
-    page = None if out is None else absolute(out)
-    owners = []
-    for target in targets:
-        if isinstance(target, str | Path):
-            owners.append(owner_of(Path(target)))
-    owner = next(filter(None, owners), None)
+    page = None
+    if out is not None:
+        page = absolute(out)
+    owner = _owner_of_any(targets)
     products = {"video": video, "recording": recording, "figures": figures}
-    if (page is None or owner) and (asked := [name for name, wanted in products.items() if wanted]):
-        if owner:
-            rule = "absent where campaigns are compared"
-        else:
-            rule = "absent without --out: nothing is written"
-        raise ParameterError("", f"--{asked[0]}", True, rule)
+    for name, is_wanted in products.items():
+        if is_wanted and owner is not None:
+            raise ParameterError("", f"--{name}", True, "absent where campaigns are compared")
+        if is_wanted and page is None:
+            raise ParameterError("", f"--{name}", True, "absent without --out: nothing is written")
     compared: Any
     if owner is not None:
         directories = [Path(str(target)) for target in targets]
@@ -535,12 +552,23 @@ def compare(
         )
     else:
         options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints, "fps": fps}
-        first = None if markdown else flown
+        if not markdown:
+            options["flown"] = flown
         with reporting(progress, "the comparison") as report:
-            compared = compare_flights(targets, page, report, overwrite=overwrite, flown=first, **options)
+            compared = compare_flights(targets, page, report, overwrite=overwrite, **options)
     if markdown:
         return Document(compared.to_markdown() + "\n", compared.to_json())
     return compared
+
+
+def _owner_of_any(targets: Sequence[ComparedName]) -> Any:
+    """Return the commands of the feature that made one of the directories, as `owner_of`; None if none did."""
+    for target in targets:
+        if isinstance(target, str | Path):
+            owner = owner_of(Path(target))
+            if owner is not None:
+                return owner
+    return None
 
 
 @app.command(
@@ -592,8 +620,14 @@ def plot(
     from quadsim.rollout.flown import Flight
     from quadsim.rollout.stored import read_flight
 
-    each = [flights] if isinstance(flights, Flight | str | Path) else flights
-    runs = [flight if isinstance(flight, Flight) else read_flight(Path(flight)) for flight in each]
+    if isinstance(flights, Flight | str | Path):
+        flights = [flights]
+    runs = []
+    for flight in flights:
+        if isinstance(flight, Flight):
+            runs.append(flight)
+        else:
+            runs.append(read_flight(Path(flight)))
     return plot_runs(runs, signals, labels=labels, width=width, style=style, out=out, overwrite=overwrite)
 
 
@@ -647,20 +681,25 @@ def film(
 
     flight = reaudit(Path(directory), products=False)
     directory = absolute(directory)
-    path = absolute(directory / rundir.VIDEO_FILE if out is None else out)
+    if out is None:
+        path = absolute(directory / rundir.VIDEO_FILE)
+    else:
+        path = absolute(out)
     if workers is not None and workers < 1:
         raise ParameterError("", "--workers", workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
     with reporting(progress, "the film") as report:
-        make = render_video if path.suffix == ".mp4" else render_gif
         estimate = Estimate()
 
-        def follow(done: int, total: int) -> None:
+        def report_frames(done: int, total: int) -> None:
             estimate(done, total)
             report("video", done, total)
 
-        render = partial(make, flight, workers=workers, fps=fps, progress=follow)
+        render: Any = render_video
+        if path.suffix == ".gif":
+            render = render_gif
+        render = partial(render, flight, workers=workers, fps=fps, progress=report_frames)
         if path.parent != directory:
             render(path, overwrite=overwrite)
         else:  # a product of the run, which its summary lists

@@ -23,9 +23,9 @@ from quadsim.commands.app import app
 from quadsim.console.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 from quadsim.errors import QuadsimError, printable
 
-# of a message: one with many problems has a line for each
-_MOST_LINES = 21
-_LONGEST_LINE = 1000
+_MOST_LINES: Final = 21
+_LONGEST_LINE: Final = 1000
+"""Lines of a message that are shown, and characters of each: one with many problems has a line for each."""
 _HOME: Final = re.compile(r"(--[\w-]+=)?(~.*)", re.DOTALL)
 
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False  # otherwise Ctrl-C ends it silently
@@ -42,12 +42,12 @@ def _parse(
     if json and "progress" in ignored:
         bound.arguments["progress"] = False
     if not json and "flown" in ignored:
-        bound.arguments["flown"] = _Verdict()
+        bound.arguments["flown"] = _EarlyPrint()
     return command, bound, json
 
 
-class _Verdict:
-    """Prints a result before its figures and its films are made."""
+class _EarlyPrint:
+    """Prints a result before its figures and its films are made, and remembers that it has."""
 
     shown = False
 
@@ -67,8 +67,8 @@ def _stdout_for(json: bool) -> contextlib.AbstractContextManager[None]:
     return printing_to_stderr()
 
 
-def _show(result: object, json: bool, *, judged: bool) -> int:
-    """Print a result, or what is left of it after the verdict; returns its exit status."""
+def _show(result: object, json: bool, early: _EarlyPrint | None) -> int:
+    """Print a result, or where that was done early, the outputs added since; returns its exit status."""
     if isinstance(result, Path):
         from quadsim.console.console import short_path
 
@@ -77,7 +77,7 @@ def _show(result: object, json: bool, *, judged: bool) -> int:
         return 0
     if json:
         print(serialising.dumps(result.to_json(), indent=2))
-    elif judged:
+    elif early is not None and early.shown:
         from quadsim.console import console
 
         console.show(result.outputs())
@@ -88,24 +88,15 @@ def _show(result: object, json: bool, *, judged: bool) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    words = [_at_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
+    if arguments is None:
+        arguments = sys.argv[1:]
+    words = [_at_home(word) for word in arguments]
     try:
         if not words:
             app.help_print()
             return EXIT_WRONG_INPUT
-        status = 0
         with _notices():
-            parsed: Any = app.meta(words, exit_on_error=False, print_error=False, result_action="return_value")
-            if parsed is not None:  # as after --help
-                command, bound, json = parsed
-                verdict = bound.arguments.get("flown")
-                try:
-                    with _stdout_for(json):
-                        result = command(*bound.args, **bound.kwargs)
-                    status = _show(result, json, judged=verdict is not None and verdict.shown)
-                except QuadsimError as error:  # a failure may carry a partial result
-                    _show(error.result, json, judged=verdict is not None and verdict.shown)
-                    raise
+            status = _run(words)
         sys.stdout.flush()
         return status
     except CycloptsError as error:
@@ -128,6 +119,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_WRONG_INPUT
 
 
+def _run(words: Sequence[str]) -> int:
+    """Parse the line, run its command and show the result; returns the exit status."""
+    parsed: Any = app.meta(words, exit_on_error=False, print_error=False, result_action="return_value")
+    if parsed is None:  # as after --help
+        return 0
+    command, bound, json = parsed
+    early = bound.arguments.get("flown")
+    try:
+        with _stdout_for(json):
+            result = command(*bound.args, **bound.kwargs)
+        return _show(result, json, early)
+    except QuadsimError as error:  # a failure may carry a partial result
+        _show(error.result, json, early)
+        raise
+
+
 def _at_home(word: str) -> str:
     """Expand `~` in a word as a shell does, also in `--out=~/x`."""
     match = _HOME.fullmatch(word)
@@ -141,14 +148,14 @@ def _complain(error: Exception) -> None:
     from quadsim.console import console
 
     lines = printable(f"quadsim: {error}", keep="\n").split("\n")
-    shown = []
+    shown: list[Any] = []
     for line in lines[:_MOST_LINES]:
-        shown.append(line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ...")
+        if len(line) > _LONGEST_LINE:
+            line = f"{line[:_LONGEST_LINE]} ..."
+        shown.append(line)
     if len(lines) > _MOST_LINES:
-        more = [f"... and {len(lines) - _MOST_LINES} more"]
-    else:
-        more = []
-    console.show([*shown, *more], console.stderr())
+        shown.append(f"... and {len(lines) - _MOST_LINES} more")
+    console.show(shown, console.stderr())
 
 
 class _Notices(logging.Handler):

@@ -22,7 +22,6 @@ from quadsim.state import N_STATES
 
 def capabilities() -> dict[str, dict[str, str]]:
     """Return this machine's capabilities by section; every installed QP solver solves one constrained step."""
-    from quadsim.mpc.solvers import solver_entries
     from quadsim.report.recording import viewer_problem
 
     here = machine()
@@ -39,14 +38,25 @@ def capabilities() -> dict[str, dict[str, str]]:
             "own method": _tried(partial(_speed_of_many, "rk4", 40)),
             "MuJoCo's step": _tried(partial(_speed_of_many, "mujoco", 5)),
         },
-        "solvers": {
-            name: _tried(partial(_try_solver, name)) if entry.installed else entry.line
-            for name, entry in solver_entries().items()
-        },
+        "solvers": _solvers(),
     }
 
 
+def _solvers() -> dict[str, str]:
+    """Return what each installed QP solver does with one step, and how the others are installed."""
+    from quadsim.mpc.solvers import solver_entries
+
+    lines = {}
+    for name, entry in solver_entries().items():
+        if entry.installed:
+            lines[name] = _tried(partial(_try_solver, name))
+        else:
+            lines[name] = entry.line
+    return lines
+
+
 def _rendering() -> str:
+    """Return the back end that renders here."""
     from quadsim.report.film.video import rendering_backend
 
     return f"renders off screen through {rendering_backend().upper()}"

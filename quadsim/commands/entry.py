@@ -1,7 +1,7 @@
 """The process of the `quadsim` command: its environment, set before any other import, its signals and streams.
 
 Ctrl-C, SIGTERM and SIGHUP all raise `KeyboardInterrupt`, unless the process was started with them ignored, as by
-`nohup`.  A command that heard one of them ends with 128 and its number, as a shell expects, whatever it has kept.
+`nohup`.  A command that received one of them ends with 128 and its number, as a shell expects, whatever it has kept.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _RENDERERS: Final = ("", "egl", "osmesa", "glfw", "disable")
 
 def main() -> int:
     """Run the command line of this process; returns the exit status."""
-    _open_what_is_closed()
-    stops = _Stops()
+    _open_closed_streams()
+    stops = _StopSignals()
     status = 0
-    left = "what was finished is kept, and nothing is half written"
+    what_is_kept = "what was finished is kept, and nothing is half written"
     try:
         try:
-            stops.hear()
+            stops.handle()
             status = _work()
         finally:
             stops.working = False
@@ -37,17 +37,17 @@ def main() -> int:
         if stops.first is None:
             raise
         if isinstance(error, KeyboardInterrupt):
-            left = str(error) or left
+            what_is_kept = str(error) or what_is_kept
     finally:
         stops.release()
     if stops.first is None:
         return status
     with contextlib.suppress(OSError):  # the terminal may be gone
-        print(f"quadsim: interrupted ({stops.name}); {left}", file=sys.stderr)
+        print(f"quadsim: interrupted ({stops.name}); {what_is_kept}", file=sys.stderr)
     return 128 + stops.first
 
 
-class _Stops:
+class _StopSignals:
     """The signals that stop this process.
 
     The first one is remembered, because the exception that it raises may be caught by whatever code runs then, where a
@@ -59,18 +59,19 @@ class _Stops:
     """Whether a signal raises `KeyboardInterrupt`; afterwards it is remembered only."""
 
     def __init__(self) -> None:
-        self._heard = [stop for stop in STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
+        self._handled = [stop for stop in STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
 
-    def hear(self) -> None:
-        for stop in self._heard:
+    def handle(self) -> None:
+        """Let each of them interrupt this process by `KeyboardInterrupt`, unless it is ignored."""
+        for stop in self._handled:
             signal.signal(stop, self._interrupt)
 
     def release(self) -> None:
         """Leave the process to its signals: one that arrives while Python shuts down kills it."""
-        signal.pthread_sigmask(signal.SIG_BLOCK, self._heard)
-        for stop in self._heard:
+        signal.pthread_sigmask(signal.SIG_BLOCK, self._handled)
+        for stop in self._handled:
             signal.signal(stop, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, self._heard)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, self._handled)
 
     @property
     def name(self) -> str:
@@ -120,7 +121,7 @@ def _set_environment() -> str | None:
     return None
 
 
-def _open_what_is_closed() -> None:
+def _open_closed_streams() -> None:
     """Open the numbers of closed streams, or the next file would receive them and whatever is printed."""
     for number in range(3):
         try:

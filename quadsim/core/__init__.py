@@ -1,4 +1,5 @@
-"""quadsim's C: one shared library of the sources in `quadsim` and `mpc`, compiled where it is missing or stale.
+"""quadsim's C: one shared library of the sources here and in `quadsim/mpc/c`, compiled where it is missing or stale.
 
-What happens at the physics rate is declared in `structs`.
+`build` compiles it and `library` loads it; `headers` reads what the C declares, `mirror` makes Python's structs and
+functions of that, and `structs` names those of the physics rate.
 """

@@ -52,12 +52,18 @@ class CompilationError(RuntimeError):
 
 def sources(root: Path = ROOT) -> list[Path]:
     """Return the C files and headers."""
-    return [file for folder in FOLDERS for file in sorted((root / folder).glob("*.[ch]"))]
+    files: list[Path] = []
+    for folder in FOLDERS:
+        files += sorted((root / folder).glob("*.[ch]"))
+    return files
 
 
 def include(root: Path = ROOT) -> list[str]:
     """Return the options for our headers, which C files of `mpc` and the table of offsets include."""
-    return [option for folder in FOLDERS for option in ("-I", str(root / folder))]
+    options = []
+    for folder in FOLDERS:
+        options += ["-I", str(root / folder)]
+    return options
 
 
 def write_layout(root: Path, folder: Path) -> Path:
@@ -80,7 +86,8 @@ def stamp(root: Path = ROOT) -> str:
     """Return a text that identifies all that determines the library's bits but the compiler: flags and sources."""
     digest = hashlib.sha256(" ".join(FLAGS).encode() + _HEADERS.read_bytes())
     for file in sources(root):
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+        name = file.relative_to(root).as_posix()
+        digest.update(name.encode() + b"\0" + file.read_bytes())
     return f"quadsim sources {digest.hexdigest()[:16]}"
 
 
@@ -91,7 +98,14 @@ def is_current(root: Path = ROOT) -> bool:
 
 def system_compiler() -> list[str]:
     """Return the command of `$CC`, else of the system's compiler; an empty list if there is none."""
-    return shlex.split(os.environ.get("CC", "")) or [path for path in map(shutil.which, COMPILERS) if path][:1]
+    stated = shlex.split(os.environ.get("CC", ""))
+    if stated:
+        return stated
+    for name in COMPILERS:
+        path = shutil.which(name)
+        if path:
+            return [path]
+    return []
 
 
 def to_publish() -> str:
@@ -123,11 +137,14 @@ def compiler() -> list[str]:
         return system_compiler()
     platform = to_publish()
     if importlib.util.find_spec("ziglang") is None:
-        lacking = f"{PLATFORM} needs the package" if platform else f"no C compiler ({', '.join(COMPILERS)}), nor"
-        raise CompilationError(f"{lacking} {ZIG}")
-    # Without either, zig compiles for the processor at hand.
-    target = ("-target", ZIG_TARGETS[platform]) if platform else ("-mcpu=baseline",)
-    return [sys.executable, "-m", "ziglang", "cc", *target]
+        if platform:
+            raise CompilationError(f"{PLATFORM} needs the package {ZIG}")
+        raise CompilationError(f"no C compiler ({', '.join(COMPILERS)}), nor {ZIG}")
+    zig = [sys.executable, "-m", "ziglang", "cc"]
+    # Without either option, zig compiles for the processor at hand.
+    if platform:
+        return [*zig, "-target", ZIG_TARGETS[platform]]
+    return [*zig, "-mcpu=baseline"]
 
 
 def platform_tag() -> str:

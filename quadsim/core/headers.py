@@ -1,19 +1,8 @@
 """What the headers of quadsim's C declare: enumerators, structs and functions.
 
 The headers are the only declaration of these; Python's mirrors follow from it (`quadsim.core.mirror`), and so does the
-table of offsets that is compiled into the library (`layout_source`).
-
-What is read is C99 in a plain form, and anything else is a `HeaderError` that names the line:
-
-- `enum NAME { A, B = 1, C = A + 2 * B };`
-- `typedef struct NAME { ... } NAME;`, its members numbers, structs, arrays of these, and pointers, also to functions;
-- `typedef double NAME;`
-- prototypes of functions that take and return numbers and pointers.
-
-`static` definitions are left out, and code of macros that are not defined: `#ifdef`, `#ifndef` and `#else` decide, but
-no declaration may stand under `#if`.  A name means the same in all headers.
-
-This file needs only the standard library: `build.py` loads it where nothing of quadsim can be imported.
+table of offsets that is compiled into the library (`layout_source`).  This file needs only the standard library:
+`build.py` loads it where nothing of quadsim can be imported.
 """
 
 from __future__ import annotations
@@ -91,6 +80,17 @@ class Declarations(NamedTuple):
 
 def read_headers(files: Iterable[Path]) -> Declarations:
     """Read headers, and what these include of one another.
+
+    What is read is C99 in a plain form, and anything else is a `HeaderError` that names the line:
+
+    - `enum NAME { A, B = 1, C = A + 2 * B };`
+    - `typedef struct NAME { ... } NAME;`, its members numbers, structs, arrays of these, and pointers, also to
+      functions;
+    - `typedef double NAME;`
+    - prototypes of functions that take and return numbers and pointers.
+
+    `static` definitions are left out, and code of macros that are not defined: `#ifdef`, `#ifndef` and `#else` decide,
+    but no declaration may stand under `#if`.  A name means the same in all headers.
 
     Raises:
         HeaderError: one has something that cannot be mirrored.
@@ -174,8 +174,10 @@ class _Reader:
         return code
 
     def _directive(self, path: Path, number: int, line: str, holds: list[bool | None]) -> None:
-        word, *others = line.strip().removeprefix("#").split(None, 1) or [""]
-        rest = others[0].strip() if others else ""
+        """Follow a directive: whether code around which it stands holds, what is defined, what is included."""
+        directive = line.strip().removeprefix("#").strip()
+        word = re.split(r"\s", directive)[0]
+        rest = directive.removeprefix(word).strip()
         if word in ("ifdef", "ifndef"):
             holds.append((rest in self._macros) == (word == "ifdef"))
         elif word == "if":
@@ -185,7 +187,8 @@ class _Reader:
         elif word == "elif":
             holds[-1] = None
         elif word == "else":
-            holds[-1] = None if holds[-1] is None else not holds[-1]
+            if holds[-1] is not None:
+                holds[-1] = not holds[-1]
         elif word == "endif":
             holds.pop()
         elif word == "define":
@@ -235,26 +238,29 @@ class _File:
 
     def read(self) -> None:
         """Read all declarations."""
-        text = self._text
-        at = 0
-        while True:
-            at = self._after_space(at)
-            if at == len(text):
-                return
-            if found := _STATIC.match(text, at):
-                at = self._end_of_definition(at, found.end())
-                continue
-            if found := _ENUM.match(text, at):
-                self._enumerators(found.start(1), found[1])
-            elif found := _STRUCT.match(text, at):
-                self._struct(at, found)
-            elif found := _TYPEDEF.match(text, at):
-                self._typedef(at, found)
-            elif found := _FUNCTION.match(text, at):
-                self._function(at, found)
+        at = self._after_space(0)
+        while at < len(self._text):
+            definition = _STATIC.match(self._text, at)
+            if definition is not None:
+                at = self._end_of_definition(at, definition.end())
             else:
-                raise self._error(at, f"{self._shown(at)!r} is not known here; see quadsim/core/headers.py")
-            at = found.end()
+                at = self._read_declaration(at)
+            at = self._after_space(at)
+
+    def _read_declaration(self, at: int) -> int:
+        """Read the declaration at a place, of the first kind that it has the form of; returns its end."""
+        kinds = (
+            (_ENUM, self._enumerators),
+            (_STRUCT, self._struct),
+            (_TYPEDEF, self._typedef),
+            (_FUNCTION, self._function),
+        )
+        for pattern, read in kinds:
+            found = pattern.match(self._text, at)
+            if found is not None:
+                read(at, found)
+                return found.end()
+        raise self._error(at, f"{self._shown(at)!r} is not known here; see quadsim/core/headers.py")
 
     def _after_space(self, at: int) -> int:
         found = _SPACE.match(self._text, at)
@@ -275,13 +281,18 @@ class _File:
                 return brace.end()
         raise self._error(start, "this definition does not end")
 
-    def _enumerators(self, at: int, body: str) -> None:
+    def _enumerators(self, at: int, found: re.Match[str]) -> None:
+        """Define the enumerators of an enumeration."""
         value = -1
-        for entry in body.split(","):
+        at = found.start(1)
+        for entry in found[1].split(","):
             name, _, stated = entry.partition("=")
             name = name.strip()
             if name:
-                value = self._number(at, stated) if stated else value + 1
+                if stated:
+                    value = self._number(at, stated)
+                else:
+                    value += 1
                 if not re.fullmatch(r"\w+", name):
                     raise self._error(at, f"{name!r} is not an enumerator")
                 if not self._reader.define(name, value):
@@ -289,11 +300,13 @@ class _File:
             at += len(entry) + 1
 
     def _typedef(self, at: int, found: re.Match[str]) -> None:
+        """Define another name of a type."""
         of = self._type(at, found[1])
         if not self._reader.define_type(found[2], of):
             raise self._error(at, f"{found[2]} is {of} here, and another type elsewhere")
 
     def _struct(self, at: int, found: re.Match[str]) -> None:
+        """Declare a struct, member by member."""
         tag, body, name = found.groups()
         if tag != name:
             raise self._error(at, f"struct {tag} must have one name, not also {name}")
@@ -311,7 +324,8 @@ class _File:
 
     def _members(self, at: int, statement: str) -> list[Variable]:
         """Return the members of a statement such as `const double *a, b[3]`."""
-        if "(" in statement and (function := _FUNCTION_POINTER.fullmatch(statement)):
+        function = _FUNCTION_POINTER.fullmatch(statement)
+        if function is not None:
             return [Variable(function[1], "void", True, ())]
         first, *others = statement.split(",")
         found = _MEMBER.fullmatch(first)
@@ -331,6 +345,7 @@ class _File:
         return members
 
     def _function(self, at: int, found: re.Match[str]) -> None:
+        """Declare a function by its prototype."""
         returned, name, given = found.groups()
         parameters: list[Variable] = []
         for text in given.split(","):
@@ -345,10 +360,10 @@ class _File:
         self._reader.functions[name] = Function(Variable("", kind, pointer, ()), tuple(parameters))
 
     def _parameter(self, at: int, text: str) -> Variable:
+        """Return a parameter such as `const double *a`; an array is a pointer."""
         found = _MEMBER.fullmatch(text)
-        if found is None:
-            declarator = None
-        else:
+        declarator = None
+        if found is not None:
             declarator = _DECLARATOR.fullmatch(found[2])
         if found is None or declarator is None:
             raise self._error(at, f"{text!r} is not a parameter that can be mirrored")
@@ -359,12 +374,14 @@ class _File:
         return Variable(declarator[2], kind, pointer, ())
 
     def _type(self, at: int, words: str) -> str:
+        """Return the type that words such as `const quadsim_real` name; see `_Reader.type_of`."""
         known = self._reader.type_of(words)
         if known is None:
             raise self._error(at, f"type {' '.join(words.split())!r} is not known here; see quadsim/core/headers.py")
         return known
 
     def _shape(self, at: int, sizes: str) -> tuple[int, ...]:
+        """Return the shape of an array from its sizes in brackets, such as `[4][N]`."""
         if not sizes:
             return ()
         return tuple(self._number(at, size) for size in _SIZE.findall(sizes))
@@ -385,6 +402,7 @@ class _File:
         return total
 
     def _shown(self, at: int) -> str:
+        """Return the line at a place, for a message."""
         line = self._text[at:].split("\n", 1)[0]
         if len(line) <= 60:
             return line

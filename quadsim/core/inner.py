@@ -47,14 +47,17 @@ class CompiledLoop:
         return np.array(struct.answer)
 
     def _engaged(self, command: Array) -> Struct:
+        """Return the struct with a command to fly."""
         struct = self._struct
-        struct.command[: command.size], struct.holds_attitude = command, command.size > len(struct.answer)
+        struct.command[: command.size] = command
+        struct.holds_attitude = command.size > len(struct.answer)
         struct.queue = self._queue.ctypes.data
         return struct
 
     def __getstate__(self) -> dict[str, Any]:
         """The struct as bytes: one with pointers cannot be copied; `engage` points it to the queue."""
-        return {**self.__dict__, "_struct": ctypes.string_at(ctypes.byref(self._struct), ctypes.sizeof(InnerStruct))}
+        content = ctypes.string_at(ctypes.byref(self._struct), ctypes.sizeof(InnerStruct))
+        return {**self.__dict__, "_struct": content}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _struct=InnerStruct.from_buffer_copy(state["_struct"]))

@@ -1,4 +1,7 @@
-"""The library of quadsim's C; `quadsim.core.mirror` gives its functions their types."""
+"""Load the library of quadsim's C, compiled before where it is missing or stale (`quadsim.core.build`).
+
+`quadsim.core.mirror` gives its functions their types.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +31,21 @@ def load_from(root: Path) -> ctypes.CDLL:
         try:
             compile_library(root)
         except CompilationError as error:
-            lines = str(error).splitlines()
-            reason = next((line for line in lines if "error:" in line), lines[0])
-            problem = f"{problem}, and it cannot be compiled ({reason}); {remedy(root)}"
+            problem = f"{problem}, and it cannot be compiled ({_first_error(str(error))}); {remedy(root)}"
             raise FileError(root / LIBRARY, problem) from error
         library = _loaded(root)
         if isinstance(library, str):
             raise FileError(root / LIBRARY, f"{library}; {remedy(root)}")
     return library
+
+
+def _first_error(printed: str) -> str:
+    """Return the first line of a compiler's output that names an error, or else its first line."""
+    lines = printed.splitlines()
+    for line in lines:
+        if "error:" in line:
+            return line
+    return lines[0]
 
 
 def _loaded(root: Path) -> ctypes.CDLL | str:
@@ -53,5 +63,7 @@ def _loaded(root: Path) -> ctypes.CDLL | str:
 
 def remedy(root: Path) -> str:
     """Return the command that compiles the library; pip fetches a compiler where there is none."""
-    checkout = (root / "hatch_build.py").is_file()
-    return "run: pip install " + (f"--editable {root}" if checkout else "--force-reinstall --no-deps quadsim")
+    is_checkout = (root / "hatch_build.py").is_file()
+    if is_checkout:
+        return f"run: pip install --editable {root}"
+    return "run: pip install --force-reinstall --no-deps quadsim"

@@ -82,7 +82,9 @@ def make_structs(declared: Declarations) -> dict[str, type[Struct]]:
     """Return the mirrors of all structs that headers declare."""
     structs: dict[str, type[Struct]] = {}
     for name, members in declared.structs.items():
-        fields = [(member.name, _kind_of_member(member, structs)) for member in members]
+        fields = []
+        for member in members:
+            fields.append((member.name, _kind_of_member(member, structs)))
         structs[name] = type(name, (Struct,), {"_fields_": fields, "__module__": __name__})
     return structs
 
@@ -104,7 +106,8 @@ def check_layout(library: ctypes.CDLL, structs: Mapping[str, type[Struct]]) -> N
             if place not in compiled:
                 raise ValueError(f"was compiled without {place}, which the headers declare")
             if compiled[place] != (offset, size):
-                there = "has {1} bytes at {0}".format(*compiled[place])
+                compiled_offset, compiled_size = compiled[place]
+                there = f"has {compiled_size} bytes at {compiled_offset}"
                 raise ValueError(f"does not agree with the headers: {place} {there}, not {size} at {offset}")
             del compiled[place]
     if compiled:
@@ -144,6 +147,7 @@ def set_members(struct: Struct, /, **values: ArrayLike) -> None:
 
 @cache
 def _declared() -> Declarations:
+    """Return what all headers of the library declare."""
     headers = [file for file in sources(ROOT) if file.suffix == ".h"]
     if not headers:
         raise FileError(ROOT / FOLDERS[0], f"the C headers are missing; {remedy(ROOT)}")
@@ -155,6 +159,7 @@ def _declared() -> Declarations:
 
 @cache
 def _structs() -> dict[str, type[Struct]]:
+    """Return the mirrors of all structs of the headers."""
     return make_structs(_declared())
 
 
@@ -173,15 +178,20 @@ def _compiled_layout(library: ctypes.CDLL) -> dict[str, tuple[int, int]]:
 
 
 def _kind_of_member(member: Variable, structs: Mapping[str, type[Struct]]) -> Any:
+    """Return the type of ctypes of a struct's member."""
     if member.pointer:
         return ctypes.c_void_p
-    kind = structs[member.type] if member.type in structs else _KINDS[member.type]
+    if member.type in structs:
+        kind: Any = structs[member.type]
+    else:
+        kind = _KINDS[member.type]
     for size in reversed(member.shape):
         kind = kind * size
     return kind
 
 
 def _kind_of_parameter(parameter: Variable, structs: Mapping[str, type[Struct]]) -> Any:
+    """Return the type of ctypes of a function's parameter."""
     if not parameter.pointer:
         return _KINDS[parameter.type]
     if parameter.type in structs:
@@ -190,6 +200,7 @@ def _kind_of_parameter(parameter: Variable, structs: Mapping[str, type[Struct]])
 
 
 def _returned(function: Function) -> Any:
+    """Return the type of ctypes of what a function returns."""
     returned = function.returned
     if returned.pointer:
         if returned.type == "char":

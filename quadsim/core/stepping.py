@@ -22,7 +22,8 @@ def step_address() -> int:
     """
     try:
         folder = Path(mujoco.__file__).parent
-        library = ctypes.CDLL(str([*folder.glob("libmujoco.*"), *folder.glob("mujoco.dll")][0]))
+        files = [*folder.glob("libmujoco.*"), *folder.glob("mujoco.dll")]
+        library = ctypes.CDLL(str(files[0]))
         step = ctypes.cast(library.mj_step, ctypes.c_void_p).value
         trap = ctypes.c_void_p.in_dll(library, "mju_user_error")
         mujoco.MjData._address, mujoco.MjModel._address  # noqa: B018 - whether there are any

@@ -36,7 +36,7 @@ from quadsim.scenarios.courses.course import Course, Headed, repeated
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.courses.followed import FollowedCourse
 from quadsim.scenarios.courses.steps import Steps
-from quadsim.scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
+from quadsim.scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_user_bounds
 from quadsim.scenarios.plugin import Plugin, import_plugin, make_force, reason_of
 from quadsim.scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent, events_of
 from quadsim.scenarios.schema.problems import parse_table
@@ -580,7 +580,7 @@ class Assembly:
 
     def with_law_bounds(self, controller: Controller) -> Assembly:
         """Return the assembly with the bounds of a user's controller as constraints of its scenario."""
-        scenario = with_law_bounds(self.scenario, controller)
+        scenario = with_user_bounds(self.scenario, controller)
         if scenario is self.scenario:
             return self
         return self.of(scenario)

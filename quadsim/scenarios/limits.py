@@ -18,8 +18,8 @@ from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.problem.polytope import Polytope
 from quadsim.mpc.tables.controller import Range
 from quadsim.report.table import format_number
-from quadsim.scenarios.law_bounds import law_limits
 from quadsim.scenarios.plugin import PluginController
+from quadsim.scenarios.user_bounds import user_limits
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import Vehicle
 
@@ -32,18 +32,16 @@ def signal_limits(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit
     return [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
 
 
-def with_law_bounds(scenario: Scenario, controller: Controller) -> Scenario:
-    """Return the scenario with the bounds of a user's controller as constraints; see `law_limits`."""
+def with_user_bounds(scenario: Scenario, controller: Controller) -> Scenario:
+    """Return the scenario with the bounds of a user's controller as constraints; see `user_limits`."""
     if isinstance(controller, Pilot):
-        adapted = controller.law
-    else:
-        adapted = controller
-    if not isinstance(adapted, PluginController):
+        controller = controller.law
+    if not isinstance(controller, PluginController):
         return scenario
-    named = _named(scenario)
+    replaced = _signals_replaced(scenario)
     limits = []
-    for limit in law_limits(adapted.law, scenario.audited_names):
-        if limit.signal == SUM or limit.signal not in named:
+    for limit in user_limits(controller.law, scenario.audited_names):
+        if limit.signal == SUM or limit.signal not in replaced:
             limits.append(limit)
     if limits:
         return scenario.altered(constraints=[*scenario.constraints, *limits])
@@ -126,9 +124,9 @@ def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
 
 def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]:
     """Yield a limit for each controller bound without an entry."""
-    named = _named(scenario)
+    replaced = _signals_replaced(scenario)
     for signal, (lower, upper) in bounds.items():
-        if signal in named:
+        if signal in replaced:
             continue
         if signal in scenario.audited_names:
             name = f"controller.{signal}"
@@ -137,7 +135,7 @@ def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]
         yield Limit(name=name, signal=signal, lower=lower, upper=upper)
 
 
-def _named(scenario: Scenario) -> set[str]:
+def _signals_replaced(scenario: Scenario) -> set[str]:
     """Return the signals whose entry replaces the controller's bounds."""
     signals = set()
     for entry in scenario.constraints:
@@ -149,9 +147,9 @@ def _named(scenario: Scenario) -> set[str]:
 
 def _range(lower: float, upper: float) -> str:
     """Return bounds in words."""
-    if math.isinf(lower) or math.isinf(upper):
-        if math.isinf(upper):
-            return f"at least {format_number(lower)}"
+    if math.isinf(upper):
+        return f"at least {format_number(lower)}"
+    if math.isinf(lower):
         return f"at most {format_number(upper)}"
     if lower == -upper:
         return f"±{format_number(upper)}"

@@ -91,7 +91,7 @@ def _read(name: str, settings: Sequence[str]) -> Scenario:
     try:
         return parse_scenario(data, source=label, directory=file.parent)
     except ScenarioError as error:
-        causes = _of_types(error.problems, name, unchanged, data)
+        causes = _explain_types(error.problems, name, unchanged, data)
         raise ScenarioError(label, [*error.problems, *causes]) from None
 
 
@@ -109,7 +109,9 @@ def apply_settings(data: dict[str, Any], settings: Sequence[str], directory: Pat
         apply_setting(data, setting, defaults)
 
 
-def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
+def _explain_types(
+    problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]
+) -> Iterator[str]:
     """Explain why a table lacks fields or has too many: its type differs from that in the file."""
     lacking = set()
     exceeding = set()

@@ -25,9 +25,9 @@ from quadsim.flight.audit import (
 )
 from quadsim.flight.rundir import findings_of
 from quadsim.rollout.flown import Flight
-from quadsim.scenarios.law_bounds import law_limits
 from quadsim.scenarios.schema.bases import merge
 from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.user_bounds import user_limits
 
 ROOT = Path(__file__).resolve().parents[2]
 STATED = {"roll": (-5.0, 5.0), "pitch": (-5.0, 5.0), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)}
@@ -226,7 +226,7 @@ def test_rows_that_combine_states_become_sums() -> None:
     C = np.zeros((2, 12))
     C[0, 0], C[0, 1], C[1, 6] = 1.0, 0.5, -2.0
     row = mpc.Constraint(name="near", lower=np.array([-np.inf, -0.2]), upper=np.array([3.0, 0.4]), C=C)
-    near, roll = law_limits(type("Law", (), {"constraints": [row]})())
+    near, roll = user_limits(type("Law", (), {"constraints": [row]})())
     assert (near.name, near.signal, near.terms, near.upper) == ("near_1", "sum", {"x": 1.0, "vx": 0.5}, 3.0)
     assert (roll.signal, roll.lower, roll.upper) == (
         "roll",

@@ -1,17 +1,7 @@
 """`yaw = "along_path"`: the heading of a course that looks where it goes.
 
-The direction of travel is that of the filtered positions, seen from above.  It is held where there is hardly any speed,
-and taken on the turn nearest the one before, half a turn to the left.  It jumps at corners, at stops and at reversals;
-the heading turns there at half the stated rate at most, half of the turn before the jump and half after it:
-
-    psi = (f + b) / 2,
-
-f the direction d limited to the rate r forwards in time, b the same backwards.  Where d turns at less than r both are d
-itself, so that bends are followed exactly.  Three moving averages then round the corners of psi off, and a flight
-starts with the heading that the vehicle has.
-
-The filter of Eq. (31) acts on the heading as on the positions; its samples lead by tau_r / 3 psi', so that what is
-followed is psi.
+psi = (f + b) / 2, with f the direction of travel d limited to a rate r forwards in time, and b the same backwards.
+`along_path` gives a course this heading, before `quadsim.scenarios.courses.followed` filters it.
 """
 
 from __future__ import annotations
@@ -39,6 +29,15 @@ _AHEAD: Final = 8.0  # time at the end of what is looked at that is not used, as
 
 def along_path(course: Course, *, response_time: float, rate: float) -> Course:
     """Return a course whose heading is the direction of travel, and its own before there is any.
+
+    The direction of travel is that of the filtered positions, seen from above.  It is held where there is hardly any
+    speed, and taken on the turn nearest the one before, half a turn to the left.  It jumps at corners, at stops and at
+    reversals; the heading turns there at half the stated rate at most, half of the turn before the jump and half after
+    it.  Where d turns at less than r both f and b are d itself, so that bends are followed exactly.  Three moving
+    averages then round the corners of psi off, and a flight starts with the heading that the vehicle has.
+
+    The filter of Eq. (31) acts on the heading as on the positions; its samples lead by tau_r / 3 psi', so that what is
+    followed is psi.
 
     Args:
         course: gives the positions; its heading counts at the start alone.

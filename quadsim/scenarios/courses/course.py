@@ -68,11 +68,7 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
 
     A path that begins elsewhere makes the course jump at its start, but by less than a turn.
     """
-    first_yaw = path.pose(np.zeros(1)).item(3)
-    surplus_turns = np.array([0.0, 0.0, 0.0, TURN * whole_turns(first_yaw - float(initial[3]))])
-    if surplus_turns.any():
-        pose = path.pose
-        path = replace(path, pose=lambda t: pose(t) - surplus_turns)
+    path = _without_surplus_turns(path, float(initial[3]))
 
     def sample(t: Array) -> Array:
         since = t - start
@@ -108,13 +104,24 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
     )
 
 
+def _without_surplus_turns(path: Path, initial_yaw: float) -> Path:
+    """Return a path whose yaw begins on the turn nearest the initial one [rad]."""
+    first_yaw = path.pose(np.zeros(1)).item(3)
+    surplus = np.array([0.0, 0.0, 0.0, TURN * whole_turns(first_yaw - initial_yaw)])
+    if not surplus.any():
+        return path
+    return replace(path, pose=lambda t: path.pose(t) - surplus)
+
+
 def repeated(course: Course, period: float, *, until: float) -> Course:
     """Return a course that starts again every `period` [s], backwards every other time if it ends elsewhere.
 
     It states positions only.  Jumps and kinks are those before `until` [s].
     """
     first, last = course.sample(np.array([0.0, period]))
-    closed = math.dist(first[:3], last[:3]) < CLOSEST and abs(math.remainder(last[3] - first[3], TURN)) < CLOSEST
+    distance = math.dist(first[:3], last[:3])
+    turned = abs(math.remainder(last[3] - first[3], TURN))
+    closed = distance < CLOSEST and turned < CLOSEST
 
     def sample(t: Array) -> Array:
         rounds, since = np.divmod(np.round(t, 9), period)

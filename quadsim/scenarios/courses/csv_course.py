@@ -266,13 +266,10 @@ def _table_of_rows(
     t = numbers[:, places["t"]]
     _check_increasing(path, t, rows, places["t"])
     positions = numbers[:, [places[quantity] for quantity in POSITION_QUANTITIES]]
-    yaw = _columns(numbers, places, ("yaw",))
-    quaternion = _columns(numbers, places, QUATERNION_QUANTITIES)
+    stated_yaw = _stated_yaw(path, numbers, places)
     heading = np.zeros(len(t))
-    if yaw is not None:
-        heading = yaw[:, 0].copy()
-    elif quaternion is not None:
-        heading = _yaw_of(path, quaternion)
+    if stated_yaw is not None:
+        heading = stated_yaw
     check_turns(path, heading)
     poses = np.column_stack([positions, unwrapped(heading, float(heading[0]))])
     velocities = _columns(numbers, places, VELOCITY_QUANTITIES)
@@ -293,7 +290,7 @@ def _table_of_rows(
         poses=poses,
         velocities=velocities,
         accelerations=accelerations,
-        has_yaw=yaw is not None or quaternion is not None,
+        has_yaw=stated_yaw is not None,
         sha256=digest,
         resolution=resolution,
         notes=tuple(notes),
@@ -318,6 +315,17 @@ def _columns(numbers: Array, places: Mapping[str, int], quantities: Sequence[str
     return numbers[:, [places[quantity] for quantity in quantities]]
 
 
+def _stated_yaw(path: FilePath, numbers: Array, places: Mapping[str, int]) -> Array | None:
+    """Return the yaw (n,) [rad] of a column, or else of quaternions; None where the file has neither."""
+    yaw = _columns(numbers, places, ("yaw",))
+    if yaw is not None:
+        return yaw[:, 0].copy()
+    quaternions = _columns(numbers, places, QUATERNION_QUANTITIES)
+    if quaternions is not None:
+        return _yaw_of(path, quaternions)
+    return None
+
+
 def _resolutions(rows: list[list[str]], places: Mapping[str, int]) -> tuple[float, ...]:
     """Return the resolutions of x, y, z [m] and yaw [rad]; 0 for a yaw that the file does not have."""
     resolutions = []
@@ -330,14 +338,14 @@ def _resolutions(rows: list[list[str]], places: Mapping[str, int]) -> tuple[floa
     return tuple(resolutions)
 
 
-def _yaw_of(path: FilePath, quaternion: Array) -> Array:
+def _yaw_of(path: FilePath, quaternions: Array) -> Array:
     """Return the yaw (n,) [rad] of attitudes (n, 4), scalar first."""
-    lengths = np.linalg.norm(quaternion, axis=1)
+    lengths = np.linalg.norm(quaternions, axis=1)
     (wrong,) = np.nonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)
     if wrong.size:
         row = int(wrong[0]) + 2
         raise FileError(path, f"row {row}: the quaternion must be of length 1; got {lengths[wrong[0]]:.4g}")
-    return quaternion_to_euler(quaternion / lengths[:, None])[:, 2]
+    return quaternion_to_euler(quaternions / lengths[:, None])[:, 2]
 
 
 def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], digest: str) -> Table:
@@ -356,16 +364,10 @@ def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], 
             pieces[:, axis, i] = numbers[:, places[f"{name}^{i}"]]
     powers = durations[:, None] ** np.arange(POLYNOMIAL_DEGREE + 1)
     ends = np.einsum("nai,ni->na", pieces, powers)
-    gaps = np.abs(pieces[1:, :, 0] - ends[:-1])
-    (apart,) = np.nonzero(gaps.max(axis=1, initial=0.0) > LARGEST_GAP)
-    if apart.size:
-        i = int(apart[0])
-        gap = float(gaps[i].max())
-        axis_name = POLYNOMIAL_AXES[first_smallest(-gaps[i], TIE_SHARE * gap)]
-        rule = "must be where the piece before it ends"
-        raise FileError(path, f"row {i + 3}, column {axis_name}^0: {rule}; it is {gap:.4g} off")
+    _check_gaps(path, starts=pieces[1:, :, 0], ends=ends[:-1])
     t = np.concatenate([[0.0], np.cumsum(durations)])
     poses = np.vstack([pieces[:, :, 0], ends[-1:]])
+    notes = (*speed_notes(path, t, poses[:, :3]), *yaw_notes(path, t, poses[:, 3]))
     return Table(
         t=t,
         poses=poses,
@@ -373,8 +375,20 @@ def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], 
         pieces=pieces,
         has_yaw=has_yaw,
         sha256=digest,
-        notes=(*speed_notes(path, t, poses[:, :3]), *yaw_notes(path, t, poses[:, 3])),
+        notes=notes,
     )
+
+
+def _check_gaps(path: FilePath, *, starts: Array, ends: Array) -> None:
+    """Refuse pieces that do not start (n - 1, 4) where those before them end (n - 1, 4) [m, m, m, rad]."""
+    gaps = np.abs(starts - ends)
+    (apart,) = np.nonzero(gaps.max(axis=1, initial=0.0) > LARGEST_GAP)
+    if apart.size:
+        i = int(apart[0])
+        gap = float(gaps[i].max())
+        axis = POLYNOMIAL_AXES[first_smallest(-gaps[i], TIE_SHARE * gap)]
+        rule = "must be where the piece before it ends"
+        raise FileError(path, f"row {i + 3}, column {axis}^0: {rule}; it is {gap:.4g} off")
 
 
 def through_rows(table: Table) -> Path:

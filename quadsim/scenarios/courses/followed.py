@@ -1,4 +1,7 @@
-"""The followed reference: a filtered course, which set-points may replace in flight."""
+"""The followed reference: a filtered course, which set-points may replace in flight.
+
+r(k) = y(k) + exp(-3 tau_s / tau_r) (r(k-1) - y(k)).  Eq. (31).  The closed loop previews its rows for the controller.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ _BLOCK: Final = 256  # rows that the course is sampled for, and filtered, at a t
 
 
 class FollowedCourse:
-    """Rows r(k) = y(k) + exp(-3 tau_s / tau_r) (r(k-1) - y(k)) of a course's samples y(k).  Eq. (31).
+    """Rows r(k) of a course's samples y(k), see the module.
 
     A set-point is not known ahead: given at t_k, it takes the place of the samples from k+1 on, axis by axis, and the
     filter runs on from row k.  An axis keeps its set-point until it is given another one.

@@ -78,6 +78,7 @@ def _merged(
     locate: Callable[[dict[str, Any], Path], None],
     above: tuple[Path, ...],
 ) -> dict[str, Any]:
+    """Return the tables of a file, merged over its base; arguments as of `read_merged`."""
     data = _read(path)
     if "base" not in data:
         return data
@@ -87,12 +88,7 @@ def _merged(
     base = _find_base(path, name, find)
     base_file, _ = base
     chain = (*above, path.resolve())
-    if base_file.resolve() in chain:
-        labels = [file.name for file in chain]
-        labels.append(source_label(base))
-        raise FileError(path, f"is its own base: {' -> '.join(labels)}")
-    if len(chain) > DEEPEST:
-        raise FileError(path, f"must have at most {DEEPEST} bases above one another")
+    _check_chain(path, chain, base)
     inherited = read_merged(base, find, locate, chain)
     locate(inherited, base_file.parent)
     if "controller" in data:
@@ -103,6 +99,17 @@ def _merged(
     if "description" not in data:
         note_changes(merged, data)
     return merged
+
+
+def _check_chain(path: Path, chain: tuple[Path, ...], base: Source) -> None:
+    """Refuse a base that is among the files that led to it, and too many of them."""
+    base_file, _ = base
+    if base_file.resolve() in chain:
+        labels = [file.name for file in chain]
+        labels.append(source_label(base))
+        raise FileError(path, f"is its own base: {' -> '.join(labels)}")
+    if len(chain) > DEEPEST:
+        raise FileError(path, f"must have at most {DEEPEST} bases above one another")
 
 
 def _find_base(path: Path, name: str, find: Callable[[str], Source]) -> Source:
@@ -165,6 +172,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge tables as `merge`, after what repeats a replaced value has been dropped."""
     merged = copy.deepcopy(dict(base))
     for key, value in over.items():
         before = merged.get(key)

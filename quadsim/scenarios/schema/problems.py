@@ -319,10 +319,10 @@ class ScenarioError(InputError):
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
-        unsaid = len(problems) - _MOST_LINES
+        not_listed = len(problems) - _MOST_LINES
         lines = [*problems[:_MOST_LINES]]
-        if unsaid > 0:
-            lines.append(f"and {unsaid} more")
+        if not_listed > 0:
+            lines.append(f"and {not_listed} more")
         super().__init__(f"{source}: " + "\n  ".join(lines))
         self.source = source
         self.problems = tuple(problems)
@@ -336,7 +336,7 @@ def parse_table(kind: type[TableType], data: Mapping[str, Any], source: str, *, 
     """
     try:
         tables = _in_types_of_files(data)
-        not_unicode = [*_not_unicode(tables)]
+        not_unicode = [*_texts_not_unicode(tables)]
     except RecursionError:
         raise ScenarioError(source, [f"must nest tables and lists at most {DEEPEST} deep"]) from None
     if not_unicode:
@@ -368,14 +368,14 @@ def _in_types_of_files(value: Any) -> Any:
     return math.inf
 
 
-def _not_unicode(data: Any, names: tuple[str, ...] = ()) -> Iterator[str]:
+def _texts_not_unicode(data: Any, names: tuple[str, ...] = ()) -> Iterator[str]:
     """Yield a line about each text that no file of ours can hold, such as the path of a folder that is not UTF-8."""
     if isinstance(data, Mapping):
         for name, entry in data.items():
-            yield from _not_unicode(entry, (*names, str(name)))
+            yield from _texts_not_unicode(entry, (*names, str(name)))
     elif isinstance(data, list):
         for i, entry in enumerate(data):
-            yield from _not_unicode(entry, (*names, str(i)))
+            yield from _texts_not_unicode(entry, (*names, str(i)))
     elif isinstance(data, str) and any("\ud800" <= character <= "\udfff" for character in data):
         yield f"{'.'.join(names)} must be UTF-8, as every path and text; got {shown(data)}; rename it"
 
@@ -390,16 +390,16 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 @functools.cache
 def _validator(kind: Any) -> SchemaValidator:
     """Return what makes a table class of nested dicts and lists."""
-    return SchemaValidator(_of_dicts_and_lists(adapter(kind).core_schema))
+    return SchemaValidator(_accepting_dicts_and_lists(adapter(kind).core_schema))
 
 
-def _of_dicts_and_lists(schema: Any) -> Any:
+def _accepting_dicts_and_lists(schema: Any) -> Any:
     """Return pydantic's schema with tables that may be dicts, and tuples that may be lists.
 
     Everything within stays strict: as in a file, 1 is a number, but true and "1" are none.
     """
     if isinstance(schema, list):
-        return [_of_dicts_and_lists(entry) for entry in schema]
+        return [_accepting_dicts_and_lists(entry) for entry in schema]
     if not isinstance(schema, dict):
         return schema
     relaxed = {}
@@ -407,7 +407,7 @@ def _of_dicts_and_lists(schema: Any) -> Any:
         if name in _NO_SCHEMA:
             relaxed[name] = entry
         else:
-            relaxed[name] = _of_dicts_and_lists(entry)
+            relaxed[name] = _accepting_dicts_and_lists(entry)
     if relaxed.get("type") in _WRITTEN_OTHERWISE:
         relaxed["strict"] = False
     return relaxed
@@ -431,14 +431,14 @@ def describe_all(
     with_wrong_parts: set[tuple[str, ...]] = set()
     for names in wrong:
         with_wrong_parts |= _enclosing(names)
-    told = []
+    described = []
     for names, details in wrong.items():
         if lists_of_wrong_length & _enclosing(names):
             continue
         if names in lists_of_wrong_length or names not in with_wrong_parts:
-            told.append(details)
-    lines = [describe(details, data, root, file=file) for details in told[:_MOST_DESCRIBED]]
-    for details in told[_MOST_DESCRIBED:]:
+            described.append(details)
+    lines = [describe(details, data, root, file=file) for details in described[:_MOST_DESCRIBED]]
+    for details in described[_MOST_DESCRIBED:]:
         lines.append(".".join(map(str, details["loc"])))
     return lines
 

@@ -1,14 +1,6 @@
-"""`[sensors.position]` and the other sensors, and `[estimator]`.
+"""`[sensors.position]` and the other sensors, and `[estimator]`: which state a controller receives.
 
-Numbers to start from:
-
-- Satellite navigation, as PX4's EKF2 takes it (defaults of `EKF2_GPS_P_NOISE`, `EKF2_GPS_V_NOISE`, `EKF2_GPS_DELAY`):
-  position 0.5 m, velocity 0.3 m/s, both 0.11 s late.
-- Motion capture, as the Crazyflie's firmware takes it (`extPosStdDev`, `extQuatStdDev` of its localization
-  service): position 0.01 m, attitude 4.5e-3 rad = 0.26 deg.
-- A MEMS rate gyro, the ADIS16448 as RotorS has it (`gazebo_imu_plugin.h`; Furrer et al., "RotorS", 2016): white noise
-  of 2 x 35 / 3600 = 0.0194 deg/s/sqrt(Hz), so 0.0194 sqrt(rate) deg/s per sample, bias walk 2 x 4 / 3600 = 0.0022
-  deg/s/sqrt(s), bias when switched on 0.5 deg/s (one standard deviation).
+`quadsim.sim.sensing` samples the sensors and `quadsim.sim.estimator` filters the samples.
 """
 
 from __future__ import annotations
@@ -26,7 +18,18 @@ from quadsim.sim.sensing import Sensor, SensorName
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """Sensors of the state; without an estimator a missing sensor is perfect, with one it is absent."""
+    """Sensors of the state; without an estimator a missing sensor is perfect, with one it is absent.
+
+    Numbers to start from:
+
+    - Satellite navigation, as PX4's EKF2 takes it (defaults of `EKF2_GPS_P_NOISE`, `EKF2_GPS_V_NOISE`,
+      `EKF2_GPS_DELAY`): position 0.5 m, velocity 0.3 m/s, both 0.11 s late.
+    - Motion capture, as the Crazyflie's firmware takes it (`extPosStdDev`, `extQuatStdDev` of its localization
+      service): position 0.01 m, attitude 4.5e-3 rad = 0.26 deg.
+    - A MEMS rate gyro, the ADIS16448 as RotorS has it (`gazebo_imu_plugin.h`; Furrer et al., "RotorS", 2016): white
+      noise of 2 x 35 / 3600 = 0.0194 deg/s/sqrt(Hz), so 0.0194 sqrt(rate) deg/s per sample, bias walk
+      2 x 4 / 3600 = 0.0022 deg/s/sqrt(s), bias when switched on 0.5 deg/s (one standard deviation).
+    """
 
     position: Annotated[Sensor | None, doc("[m] world frame: satellite navigation or motion capture")] = None
     velocity: Annotated[Sensor | None, doc("[m/s] world frame")] = None

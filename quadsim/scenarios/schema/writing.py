@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args, get_origin
 
 import tomlkit
@@ -69,7 +70,7 @@ def to_toml(model: Any, stated: Mapping[str, Any] | None = None, recorded: Mappi
     """
     if stated is None:
         stated = plain(model)
-    lines = _lines(model, "", set(), stated, recorded or {})
+    lines = _Writer(recorded or {}).table(model, "", stated)
     return "\n".join(lines) + "\n"
 
 
@@ -109,101 +110,129 @@ def _without_defaults(value: Any) -> Any:
     return stated
 
 
-def _lines(
-    model: Any, path: str, explained: set[object], stated: Mapping[str, Any], recorded: Mapping[str, str]
-) -> Iterator[str]:
-    """Yield the lines of a table: numbers, texts and small lists, then its subtables, in order of declaration."""
-    subtables: list[tuple[str, Any, str]] = []
-    for name, field in _fields_type_first(type(model)):
-        value = getattr(model, name)
-        kinds = tables_in(field.annotation)
-        is_new = (type(model), name) not in explained
-        explained.add((type(model), name))
+@dataclass(frozen=True, kw_only=True)
+class _Entry:
+    """A field of a table, with its value and what is said about it."""
+
+    name: str
+    value: Any
+    kinds: tuple[type[Any], ...]  # of the tables in its type
+    is_first: bool  # whether its kind of table has not occurred before
+    comment: str  # its description where it is first, else empty
+
+    def is_subtable(self, path: str) -> bool:
+        """Return whether it has a header of its own, in a table at a path; lists have one in the outermost table."""
+        if is_absent(self.value):
+            return bool(self.kinds)
+        if is_table(type(self.value)) or isinstance(self.value, Mapping):
+            return True
+        return bool(self.value and self.kinds and not path)
+
+
+class _Writer:
+    """Writes tables; a field is explained where its kind of table first occurs."""
+
+    def __init__(self, recorded: Mapping[str, str]) -> None:
+        self._recorded = recorded
+        self._explained: set[object] = set()
+
+    def table(self, model: Any, path: str, stated: Mapping[str, Any]) -> Iterator[str]:
+        """Yield the lines of a table: numbers, texts and small lists, then its subtables, in order of declaration."""
+        subtables = []
+        for name, field in _fields_type_first(type(model)):
+            entry = self._entry(type(model), name, field, getattr(model, name))
+            if entry.is_subtable(path):
+                subtables.append(entry)
+            else:
+                yield from self._field(entry, path, stated)
+        for entry in subtables:
+            yield from self._subtable(entry, path, stated)
+
+    def _entry(self, kind: type[Any], name: str, field: FieldInfo, value: Any) -> _Entry:
+        is_first = (kind, name) not in self._explained
+        self._explained.add((kind, name))
         comment = ""
-        if is_new:
+        if is_first:
             comment = _description(field)
-        if is_table(type(value)):
-            if is_new:
-                comment = comment or headline(type(value))
-            subtables.append((name, value, comment))
-        elif isinstance(value, Mapping) or (value and kinds and not path):
-            subtables.append((name, value, comment))
-        elif is_absent(value):
-            if is_new and kinds:
-                subtables.append((name, None, comment or _headlines(kinds)))
-            elif is_new:
-                yield from _commented(f"# {name} =", comment)
-        elif name not in stated:
-            yield from _commented(_unstated(_pair(name, value)), _labelled_as("derived", comment))
+        kinds = tables_in(field.annotation)
+        return _Entry(name=name, value=value, kinds=kinds, is_first=is_first, comment=comment)
+
+    def _field(self, entry: _Entry, path: str, stated: Mapping[str, Any]) -> Iterator[str]:
+        """Yield the lines of a number, a text or a small list."""
+        comment = entry.comment
+        if is_absent(entry.value):
+            if entry.is_first:
+                yield from _commented(f"# {entry.name} =", comment)
+        elif entry.name not in stated:
+            yield from _commented(_unstated(_pair(entry.name, entry.value)), _labelled_as("derived", comment))
         else:
-            if kinds not in explained:
-                yield from _about_entries(kinds)
-            explained.add(kinds)
-            source = recorded.get(f"{path}{name}")
+            if entry.kinds not in self._explained:
+                yield from _about_entries(entry.kinds)
+            self._explained.add(entry.kinds)
+            source = self._recorded.get(f"{path}{entry.name}")
             if source:
                 comment = _labelled_as(f"of {source}", comment)
-            yield from _commented(_pair(name, value), comment)
-    for name, value, comment in subtables:
-        place = f"{path}{name}"
-        if value is None:
-            field = fields_of(type(model))[name]
-            yield from _absent(place, tables_in(field.annotation), comment, explained)
+            yield from _commented(_pair(entry.name, entry.value), comment)
+
+    def _subtable(self, entry: _Entry, path: str, stated: Mapping[str, Any]) -> Iterator[str]:
+        """Yield a table within another one, or a list of tables, with its header."""
+        place = f"{path}{entry.name}"
+        value = entry.value
+        comment = entry.comment
+        if is_absent(value):
+            if entry.is_first:
+                yield from self._absent(place, entry.kinds, comment or _headlines(entry.kinds))
         elif isinstance(value, list | tuple):
-            yield from _list_of_tables(name, value, comment, explained, recorded)
+            yield from self._list_of_tables(entry)
         elif isinstance(value, Mapping):
             yield from ["", *_commented(f"[{place}]", comment)]
-            for key, entry in value.items():
-                yield _pair(key, entry)
-        elif name in stated:
-            yield from ["", *_commented(f"[{place}]", comment)]
-            yield from _lines(value, f"{place}.", explained, stated[name], recorded)
+            for key, number in value.items():
+                yield _pair(key, number)
         else:
-            yield from ["", *_commented(f"# [{place}]", _labelled_as("derived", comment))]
-            yield from _lines(value, f"{place}.", explained, {}, recorded)
+            if entry.is_first:
+                comment = comment or headline(type(value))
+            if entry.name in stated:
+                yield from ["", *_commented(f"[{place}]", comment)]
+                yield from self.table(value, f"{place}.", stated[entry.name])
+            else:
+                yield from ["", *_commented(f"# [{place}]", _labelled_as("derived", comment))]
+                yield from self.table(value, f"{place}.", {})
 
+    def _list_of_tables(self, entry: _Entry) -> Iterator[str]:
+        """Yield a list of tables; a kind's headline stands where it first occurs, unless the comment says enough."""
+        yield from ["", *_wrapped(entry.comment)]
+        several = len({type(table) for table in entry.value}) > 1
+        for table in entry.value:
+            kind = type(table)
+            about = ""
+            if (several or not entry.comment) and kind not in self._explained:
+                about = headline(kind)
+            self._explained.add(kind)
+            yield from ["", *_commented(f"[[{entry.name}]]", about)]
+            yield from self.table(table, f"{entry.name}.", plain(table))
 
-def _list_of_tables(
-    name: str, entries: Sequence[Any], comment: str, explained: set[object], recorded: Mapping[str, str]
-) -> Iterator[str]:
-    """Yield a list of tables; a kind's headline stands where it first occurs, unless the list's comment says enough."""
-    yield from ["", *_wrapped(comment)]
-    several = len({type(entry) for entry in entries}) > 1
-    for entry in entries:
-        kind = type(entry)
-        about = ""
-        if (several or not comment) and kind not in explained:
-            about = headline(kind)
-        explained.add(kind)
-        yield from ["", *_commented(f"[[{name}]]", about)]
-        yield from _lines(entry, f"{name}.", explained, plain(entry), recorded)
-
-
-def _absent(path: str, kinds: Sequence[type[Any]], comment: str, explained: set[object]) -> Iterator[str]:
-    """Yield an absent table in comments: its fields with their defaults, then its subtables."""
-    yield from ["", *_commented(f"# [{path}]", comment)]
-    if len(kinds) > 1:
-        yield from _about_entries(kinds)
-        return
-    (kind,) = kinds
-    subtables: list[tuple[str, tuple[type[Any], ...], str]] = []
-    for name, field in _fields_type_first(kind):
-        is_new = (kind, name) not in explained
-        explained.add((kind, name))
-        about = ""
-        if is_new:
-            about = _description(field)
-        default = field.get_default(call_default_factory=True)
-        tables = tables_in(field.annotation)
-        if tables and not isinstance(default, list | tuple):
-            if is_new:
-                about = about or _headlines(tables)
-            subtables.append((name, tables, about))
-        elif default is PydanticUndefined or is_absent(default):
-            yield from _commented(f"# {name} =", about)
-        else:
-            yield from _commented(_unstated(_pair(name, plain(default))), about)
-    for name, tables, about in subtables:
-        yield from _absent(f"{path}.{name}", tables, about, explained)
+    def _absent(self, path: str, kinds: Sequence[type[Any]], comment: str) -> Iterator[str]:
+        """Yield an absent table in comments: its fields with their defaults, then its subtables."""
+        yield from ["", *_commented(f"# [{path}]", comment)]
+        if len(kinds) > 1:
+            yield from _about_entries(kinds)
+            return
+        (kind,) = kinds
+        subtables = []
+        for name, field in _fields_type_first(kind):
+            default = field.get_default(call_default_factory=True)
+            entry = self._entry(kind, name, field, default)
+            if entry.kinds and not isinstance(default, list | tuple):
+                subtables.append(entry)
+            elif default is PydanticUndefined or is_absent(default):
+                yield from _commented(f"# {name} =", entry.comment)
+            else:
+                yield from _commented(_unstated(_pair(name, plain(default))), entry.comment)
+        for entry in subtables:
+            about = entry.comment
+            if entry.is_first:
+                about = about or _headlines(entry.kinds)
+            yield from self._absent(f"{path}.{entry.name}", entry.kinds, about)
 
 
 def _unstated(text: str) -> str:

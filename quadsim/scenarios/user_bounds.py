@@ -26,29 +26,30 @@ _SPEEDS: Final = tuple(f"speed_{j + 1}" for j in range(N_ROTORS))
 _log: Final = logging.getLogger("quadsim")
 
 
-def law_limits(law: object, taken: Iterable[str] = ()) -> list[Limit]:
+def user_limits(controller: object, taken: Iterable[str] = ()) -> list[Limit]:
     """Return what a user's controller says of its bounds, as limits with distinct names.
 
     Args:
-        law: has none, one or more of `problem`, a `quadsim.mpc.Problem`; `bounds`, a `quadsim.mpc.Bounds` or pairs by
-            signal, in the units of the audit; `constraints`, a list of `quadsim.mpc.Constraint` or of entries as in
-            `[[constraints]]`.
+        controller: the user's object, with none, one or more of `problem`, a `quadsim.mpc.Problem`; `bounds`, a
+            `quadsim.mpc.Bounds` or pairs by signal, in the units of the audit; `constraints`, a list of
+            `quadsim.mpc.Constraint` or of entries as in `[[constraints]]`.
         taken: names that are not free.
     """
     names = set(taken)
-    limits = dict[tuple[Any, ...], Limit]()
+    distinct: dict[tuple[Any, ...], Limit] = {}
     for source in _SOURCES:
         try:
-            found = list(_limits(getattr(law, source, None), source))
+            limits = list(_limits(getattr(controller, source, None), source))
         except (ArithmeticError, AttributeError, InputError, LookupError, TypeError, ValueError) as error:
             _log.warning("the controller's %s are not audited: %s", source, error)
             continue
-        for limit in found:
-            key = (limit.signal, limit.lower, limit.upper, *(limit.terms or {}).items())
-            if key not in limits and limit.name not in names:
-                limits[key] = limit
+        for limit in limits:
+            terms = limit.terms or {}
+            bound = (limit.signal, limit.lower, limit.upper, *terms.items())
+            if bound not in distinct and limit.name not in names:
+                distinct[bound] = limit
                 names.add(limit.name)
-    return list(limits.values())
+    return list(distinct.values())
 
 
 def _limits(stated: Any, source: str) -> Iterator[Limit]:
