@@ -18,7 +18,7 @@ from quadsim.errors import InputError
 from quadsim.features.identify.axes import check_rate_axes, check_tilt, check_velocity_axes
 from quadsim.features.identify.clocks import check_clocks
 from quadsim.features.identify.quantities import RPM
-from quadsim.features.identify.record import HELD_INPUTS, ROTOR_INPUTS, SLOWEST_COMMANDS, Record, rotor_inputs
+from quadsim.features.identify.record import HELD_INPUTS, ROTOR_INPUTS, SLOWEST_COMMANDS, Record, in_parts, rotor_inputs
 from quadsim.features.identify.rotor_order import check_rotor_order
 from quadsim.features.identify.rotor_speeds import check_against_commands, check_against_each_other, check_not_commands
 from quadsim.features.identify.scales import check_scales
@@ -294,7 +294,7 @@ def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
         rows = getattr(record, field)
         if rows is None:
             continue
-        flown = np.concatenate([rows[part] for part in parts])
+        flown = in_parts(rows, parts)
         low = flown.min()
         high = flown.max()
         near = AT_LIMIT * (high - low)

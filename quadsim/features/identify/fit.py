@@ -99,7 +99,7 @@ def _negative_damping(search: Search) -> dict[str, float]:
     """Sought numbers that would drive a motion instead of slowing it, each with the 0 to hold it at."""
     parameters = search.parameters(search.x, 0)
     values = dict(zip(DAMPING, (*parameters.rate_damping, parameters.inflow), strict=True))
-    sought = {parameter.name for parameter in search.free}
+    sought = search.names
     return {name: 0.0 for name, value in values.items() if value < 0.0 and name in sought}
 
 
@@ -119,6 +119,7 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
     values, moved = judgement.moved_to(refined)
     estimates = {**judgement.estimates, **moved}.values()
     flights = tuple(_flight_numbers(refined, flight) for flight in range(refined.flight_count))
+    delays, offsets, winds = zip(*flights, strict=True)
 
     def of_response(name: str, sought: float) -> float:
         """What measured speeds show of the response to throttle and voltage, else what was searched for."""
@@ -130,9 +131,9 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
     return Identification(
         estimates=tuple(estimates),
         vehicle=_vehicle(judgement, values),
-        delay=np.mean([flight.delay for flight in flights], axis=0).tolist(),
-        offset=tuple(np.mean([flight.offset for flight in flights], axis=0).tolist()),
-        wind=tuple(np.mean([flight.wind for flight in flights], axis=0).tolist()),
+        delay=float(np.mean(delays)),
+        offset=tuple(np.mean(offsets, axis=0).tolist()),
+        wind=tuple(np.mean(winds, axis=0).tolist()),
         flights=flights,
         throttle_curve=of_response("throttle_curve", parameters.throttle_curve),
         voltage_exponent=of_response("voltage_exponent", parameters.voltage_exponent),

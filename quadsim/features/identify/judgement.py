@@ -145,9 +145,8 @@ class JudgedFit:
                 held[name] = self.vehicle.throttle_share
             else:
                 held[name] = 0.0
-        sought = {parameter.name for parameter in self.search.free}
-        known = {name: value for name, value in held.items() if name in sought or name in self.search.fixed}
-        return {**self.search.fixed, **known}
+        known = {*self.search.names, *self.search.fixed}
+        return {**self.search.fixed, **{name: held[name] for name in held if name in known}}
 
     def refuse_moved(self, refined: Search) -> dict[str, float]:
         """Judge the intervals that another search widened; return what is to be held since, as `held` does."""
@@ -236,11 +235,10 @@ class JudgedFit:
 
     def _wind_makes_torque(self) -> bool:
         """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
-        free = self.search.free
-        if not any(parameter.name == "wind" for parameter in free):
+        if "wind" not in self.search.names:
             return False
         deviations = np.sqrt(np.diag(self.intervals.covariance))
-        for place, parameter in enumerate(free):
+        for place, parameter in enumerate(self.search.free):
             if parameter.name.startswith("rotor_moment"):
                 moment = parameter.value(self.search.x[place])
                 if abs(moment) > 2.0 * deviations[place] * (parameter.scale or 0.0):
@@ -276,8 +274,7 @@ class JudgedFit:
         estimate = self._judged(name, value, ends, self._fault(name, places, half, value))
         if not WIDEST < half < _REPEATABLE * WIDEST or not estimate.refused.startswith(_NOT_EXCITED):
             return estimate
-        flown = sum(part.seconds for part in self.search.parts)
-        needed = flown * (half / WIDEST) ** 2
+        needed = self.search.seconds * (half / WIDEST) ** 2
         return replace(estimate, advice=f"{estimate.advice}, or the same again, {needed:.0f} s in all")
 
     def _speaks_against_the_start(self, place: int) -> bool:

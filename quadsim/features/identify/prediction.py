@@ -208,10 +208,11 @@ def predict(
     residuals = {}
     for model in spans_predicted[0].residuals:
         residuals[model] = np.concatenate([span.residuals[model] for span in spans_predicted])
+    longest = max(spans_predicted, key=lambda span: len(span.trace.t))
     return PredictionErrors(
         windows=len(errors[IDENTIFIED]),
         errors={model: of_windows.mean(axis=0) for model, of_windows in errors.items()},
-        trace=max((span.trace for span in spans_predicted), key=lambda trace: len(trace.t)),
+        trace=longest.trace,
         ends=_one_after_the_other([span.t for span in spans_predicted]),
         residuals=residuals,
     )
@@ -437,4 +438,6 @@ def _with_inputs_held(record: Record) -> Record:
     there = np.isfinite(np.column_stack([*inputs.values()])).all(axis=1)
     rows = np.where(there, np.arange(len(record.t)), int(there.argmax()))
     latest = np.maximum.accumulate(rows)
-    return replace(record, **{name: rows[latest] for name, rows in inputs.items()})
+    for name in inputs:
+        inputs[name] = inputs[name][latest]
+    return replace(record, **inputs)

@@ -1,19 +1,12 @@
 """Which columns of a log are which quantity, in which unit, sign and frame: by a format's own names, or by a map.
 
-`to_series` gives sign * (logged - zero) * scale, in our units and frames, which `record` samples on one clock.  A map
-is a TOML file with a table for each quantity that it names:
-
-    [rates]
-    columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
-    unit = "deg/s"
-    sign = [1, -1, -1]
-    frame = "FLU"
+`to_series` gives sign * (logged - zero) * scale, in our units and frames, which `record` samples on one clock.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -134,7 +127,13 @@ def usual_names(quantity: str, *ways: str, unit: str = "") -> tuple[NamedQuantit
 
 
 def read_map(path: Path) -> tuple[NamedQuantity, ...]:
-    """Read a map of columns.
+    """Read a map of columns: a TOML file with a table for each quantity that it names.
+
+        [rates]
+        columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
+        unit = "deg/s"
+        sign = [1, -1, -1]
+        frame = "FLU"
 
     Raises:
         FileError: it is not TOML, or a table of it is not as it should be; the message names the field.
@@ -156,31 +155,36 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
     if unknown:
         raise FileError(path, f"{quantity} has no {unknown[0]!r}; its fields are {fields}")
     given = defaults | table
-
-    def require(field: str, right: bool, rule: str) -> None:
-        if not right:
-            raise FileError(path, f"{quantity}.{field} must be {rule}; got {given[field]!r:.80}")
-
-    names = given["columns"]
-    are_names = isinstance(names, list) and len(names) == size and all(isinstance(name, str) for name in names)
-    require("columns", are_names, f"a list of {size} name{'s' * (size > 1)}")
-    require("unit", given["unit"] in [*units], f"one of {', '.join(map(repr, units))}")
-    signs = given["sign"]
-    are_signs = isinstance(signs, list) and len(signs) == size and all(sign in (1, -1) for sign in signs)
-    require("sign", are_signs, f"a list of {size} of 1 and -1")
-    down = False
-    if frames:
-        require("frame", given["frame"] in frames, f"one of {', '.join(map(repr, frames))}")
-        down = given["frame"] == frames[1]
+    for field, rule in _broken_rules(LOGGED[quantity], given):
+        raise FileError(path, f"{quantity}.{field} must be {rule}; got {given[field]!r:.80}")
     zero, scale = units[given["unit"]]
     return NamedQuantity(
         quantity=quantity,
-        columns=tuple(names),
+        columns=tuple(given["columns"]),
         zero=zero,
         scale=scale,
-        sign=tuple(map(float, signs)),
-        down=down,
+        sign=tuple(map(float, given["sign"])),
+        down=frames is not None and given["frame"] == frames[1],
     )
+
+
+def _broken_rules(quantity: Quantity, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The fields of a map's table that are not as they should be, and what they should be."""
+    size, units, frames = quantity
+    names = given["columns"]
+    if not _has_size(names, size) or not all(isinstance(name, str) for name in names):
+        yield "columns", f"a list of {size} name{'s' * (size > 1)}"
+    if given["unit"] not in [*units]:
+        yield "unit", f"one of {', '.join(map(repr, units))}"
+    signs = given["sign"]
+    if not _has_size(signs, size) or not all(sign in (1, -1) for sign in signs):
+        yield "sign", f"a list of {size} of 1 and -1"
+    if frames and given["frame"] not in frames:
+        yield "frame", f"one of {', '.join(map(repr, frames))}"
+
+
+def _has_size(values: Any, size: int) -> bool:
+    return isinstance(values, list) and len(values) == size
 
 
 def to_series(

@@ -118,6 +118,11 @@ def new_rows(record: Record) -> Indices:
     return np.flatnonzero(record.fresh)
 
 
+def in_parts(rows: Array, parts: Sequence[slice]) -> Array:
+    """The rows in some parts of a record, one after the other."""
+    return np.concatenate([rows[part] for part in parts])
+
+
 def rotor_inputs(record: Record) -> Array:
     """What drives the rotors (N, 4): measured speeds, else the commands or the throttle."""
     if record.speeds is not None:
@@ -178,8 +183,11 @@ def _format_of(file: Path) -> LogFormat:
     for kind in FORMATS:
         if file.suffix.lower() in kind.suffixes:
             return kind
-    suffixes = ", ".join(suffix for kind in FORMATS for suffix in kind.suffixes)
-    raise FileError(file, f"is not a log that can be read (these can: {suffixes}, and those of a Crazyflie)")
+    suffixes: list[str] = []
+    for kind in FORMATS:
+        suffixes += kind.suffixes
+    listed = ", ".join(suffixes)
+    raise FileError(file, f"is not a log that can be read (these can: {listed}, and those of a Crazyflie)")
 
 
 def to_record(name: str, series: Mapping[str, Column]) -> Record:
@@ -188,8 +196,9 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
     has no gaps: it changes slowly; nor has `flying`, which changes rarely.
     """
-    flying = series.get("flying")
-    kept, notes = _without_failed_samples(name, {f: column for f, column in series.items() if f != "flying"})
+    logged = dict(series)
+    flying = logged.pop("flying", None)
+    kept, notes = _without_failed_samples(name, logged)
     voltage = kept.pop("voltage", None)
     fresh = kept.pop("fresh", None)
     force = kept.pop("specific_force", None)
@@ -203,17 +212,14 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     for field, column in moving.items():
         values[field] = _sampled(column, grid, held=field in HELD_INPUTS)
     _normalise_rows(values["attitude"])
+    velocity_period = _usual_period(moving["velocity"].t)
     if inertial:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
-    elif force is not None:
-        velocity_period = _usual_period(moving["velocity"].t)
-        if velocity_period > SLOWEST_VELOCITY:
-            inertial_velocity = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
-            window = round(2.0 * velocity_period / period)
-            values["velocity"] = filled_in(values["velocity"], inertial_velocity, window)
-            notes.append(
-                f"{name}: the velocity is logged at {1.0 / velocity_period:.3g} Hz; the accelerometer fills it in"
-            )
+    elif force is not None and velocity_period > SLOWEST_VELOCITY:
+        by_force = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
+        values["velocity"] = filled_in(values["velocity"], by_force, round(2.0 * velocity_period / period))
+        rate = 1.0 / velocity_period
+        notes.append(f"{name}: the velocity is logged at {rate:.3g} Hz; the accelerometer fills it in")
     if voltage is not None:
         there = np.isfinite(voltage.values[:, 0])
         if there.any():

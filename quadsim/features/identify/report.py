@@ -270,38 +270,23 @@ def identify_logs(
     file = None if out is None else require_file(out, overwrite=overwrite)
     page = None if page is None else require_file(page, overwrite=overwrite)
     vehicle = load_vehicle(start)
-    usable, notes = _usable(logs, vehicle, poles, columns)
-    usable_tests, test_notes = _usable(test, vehicle, poles, columns)
-    both = [*usable, *usable_tests]
-    _refuse_same_flights([log.record for log in both])
-    records = [log.record for log in usable]
-    tested = [log.record for log in usable_tests]
-    fitted = [log.spans for log in usable]
-    held_out = [log.spans for log in usable_tests]
-    names = tuple(record.name for record in records)
+    fitted, notes = _usable(logs, vehicle, poles, columns)
+    tested, test_notes = _usable(test, vehicle, poles, columns)
+    notes += test_notes
+    for log in (*fitted, *tested):
+        notes += log.notes
+    _refuse_same_flights([*fitted, *tested])
+    names = tuple(log.record.name for log in fitted)
     with judging(", ".join(names)):
-        if not tested:
-            cuts = [hold_out(record, spans) for record, spans in zip(records, fitted, strict=True)]
-            fitted = [fitted_spans for fitted_spans, _ in cuts]
-            held_out = [held_spans for _, held_spans in cuts]
-        try:
-            identification = identify_records(records, fitted, vehicle, wind=wind)
-        except ParameterError as error:
-            if error.owner != "vehicle":
-                raise
-            raise InputError(
-                f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
-                "range, or what was kept and does not suit what was identified"
-            ) from None
-        prediction = predict(tested or records, held_out, identification, vehicle, fitted=not tested)
+        identification, prediction = _fit_and_predict(fitted, tested, start, vehicle, wind=wind)
     if prediction.lost and not anyway:
         file = None
     result = IdentifiedVehicle(
         identification=identification,
         prediction=prediction,
-        notes=(*notes, *test_notes, *(note for log in both for note in log.notes)),
+        notes=tuple(notes),
         logs=names,
-        test=tuple(record.name for record in tested),
+        test=tuple(log.record.name for log in tested),
         content=vehicle_text(identification, start, names),
         file=file,
         page=page,
@@ -316,10 +301,39 @@ def identify_logs(
     return result
 
 
-def _refuse_same_flights(records: Sequence[Record]) -> None:
-    for one, other in itertools.combinations(records, 2):
-        if np.array_equal(one.rates, other.rates):
-            raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
+def _fit_and_predict(
+    fitted: Sequence[_Usable], tested: Sequence[_Usable], start: Path, vehicle: Vehicle, *, wind: bool
+) -> tuple[Identification, PredictionErrors]:
+    """Fit some logs, and predict others; without others, what is held out of those that are fitted."""
+    records = [log.record for log in fitted]
+    predicted = records
+    fitted_spans = []
+    held_spans = []
+    if tested:
+        predicted = [log.record for log in tested]
+        fitted_spans = [log.spans for log in fitted]
+        held_spans = [log.spans for log in tested]
+    else:
+        for log in fitted:
+            first, last = hold_out(log.record, log.spans)
+            fitted_spans.append(first)
+            held_spans.append(last)
+    try:
+        identification = identify_records(records, fitted_spans, vehicle, wind=wind)
+    except ParameterError as error:
+        if error.owner != "vehicle":
+            raise
+        raise InputError(
+            f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
+            "range, or what was kept and does not suit what was identified"
+        ) from None
+    return identification, predict(predicted, held_spans, identification, vehicle, fitted=not tested)
+
+
+def _refuse_same_flights(logs: Sequence[_Usable]) -> None:
+    for one, other in itertools.combinations(logs, 2):
+        if np.array_equal(one.record.rates, other.record.rates):
+            raise InputError(f"{one.record.name} and {other.record.name} are the same flight: name it once")
 
 
 def _usable(

@@ -203,21 +203,31 @@ class Search:
         first_errors = np.zeros(len(INCREMENTS) * len(parts))
         self._first_errors = self._free_count + len(reflections)  # where the errors of first samples begin in x
         self.x = np.concatenate([np.zeros(self._free_count), reflections, first_errors])
-        self._weights = np.concatenate(
-            [
-                [_weight(parameter.deviation) for parameter in self.free],
-                np.full(len(reflections), _weight(_REFLECTION_DEVIATION)),
-                np.full(len(first_errors), _weight(_FIRST_ERROR_DEVIATION)),
-            ]
-        )
+        deviations = [parameter.deviation for parameter in self.free]
+        deviations += [_REFLECTION_DEVIATION] * len(reflections)
+        deviations += [_FIRST_ERROR_DEVIATION] * len(first_errors)
+        self._weights = np.array([_weight(deviation) for deviation in deviations])
         self._fading = math.exp(-parts[0].step / LONGEST_FORCE)
-        self._skip = [int(np.searchsorted(part.starts, int(SETTLING / part.record.period))) for part in parts]
+        self._skip = []  # how many increments of each stretch begin before its rotors have settled
+        for part in parts:
+            settled = int(SETTLING / part.record.period)
+            self._skip.append(int(np.searchsorted(part.starts, settled)))
         self.settled = True  # whether instruments, if there are any, gave moments of inertia
         self.sigma = np.ones((self.flight_count, len(INCREMENTS)))  # of the innovations of each flight [rad/s, m/s]
         self._winds = []  # (K, 3) where each stretch's wind is in x
         for i in range(len(parts)):
             places = [place for place, parameter in enumerate(self.free) if parameter.part == i]
             self._winds.append(np.array(places, int).reshape(-1, 3))
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the free parameters, by place in x."""
+        return [parameter.name for parameter in self.free]
+
+    @property
+    def seconds(self) -> float:
+        """How long all stretches fly [s]."""
+        return sum(part.seconds for part in self.parts)
 
     def in_steady_wind(self, x: Array) -> Array:
         """The same numbers with the wind of each stretch at its mean."""
@@ -313,12 +323,15 @@ class Search:
 
     def _joint_priors(self, x: Array) -> Iterator[_JointPrior]:
         """A body that is about flat, rotors that rise about as fast as they fall, and wind that changes slowly."""
-        places = {parameter.name: place for place, parameter in enumerate(self.free)}
+        places = dict(zip(self.names, range(self._free_count), strict=True))
         if "inertia_z" in places:
             inertia = self.parameters(x, 0).inertia
             level = inertia[0] + inertia[1]
             shares = {"inertia_z": 1.0, "inertia_x": -inertia[0] / level, "inertia_y": -inertia[1] / level}
-            slopes = {places[name]: share for name, share in shares.items() if name in places}
+            slopes = {}
+            for name, share in shares.items():
+                if name in places:
+                    slopes[places[name]] = share
             yield _JointPrior(slopes, float(np.log(inertia[2] / level / FLAT_BODY)), FLAT_BODY_DEVIATION)
         if "rotor_rise" in places and "rotor_fall" in places:
             rise = places["rotor_rise"]
@@ -383,10 +396,9 @@ class Search:
 
     def rows(self, part: int) -> list[Indices]:
         """The samples of each block of a stretch."""
-        flown = sum(part.seconds for part in self.parts)
         size = len(self.parts[part].increments) - self._skip[part]
         seconds = size * self.parts[part].step
-        block = max(SHORTEST_BLOCK, flown / _MAX_BLOCKS)
+        block = max(SHORTEST_BLOCK, self.seconds / _MAX_BLOCKS)
         count = max(math.ceil(MIN_BLOCKS / len(self.parts)), round(seconds / block))
         return np.array_split(np.arange(size), count)
 
@@ -437,8 +449,7 @@ class Search:
 
     def _instrumented_places(self) -> list[int]:
         """Where in x the moments of inertia are that the thrust turns: for yaw, the commands predict too little."""
-        names = ("inertia_x", "inertia_y")
-        return [place for place, parameter in enumerate(self.free) if parameter.name in names]
+        return [place for place, name in enumerate(self.names) if name in ("inertia_x", "inertia_y")]
 
     def _instruments(self, part: int, slopes: Array, speeds: Array) -> Array:
         """Slopes (N, 6, X) with those by the moments of inertia at the speeds (N, 4) that the commands predict."""
@@ -489,9 +500,8 @@ class Search:
     def _with_priors(self, blocks: Sequence[NormalEquations]) -> tuple[Array, Array]:
         """H and g of all blocks and the priors together."""
         _, prior = self.prior(self.x)
-        H = sum(block.H for block in blocks) + prior.H
-        g = sum(block.g for block in blocks) + prior.g
-        return H, g
+        whole = joined(blocks)
+        return whole.H + prior.H, whole.g + prior.g
 
     def _maximise_likelihood(self) -> None:
         """Gauss-Newton steps, damped by Levenberg and Marquardt."""
@@ -534,6 +544,14 @@ class Search:
             self.x[place] = coordinates[owner].pop(0)
         self.x[self._free_count :] = other.x[other._free_count :]
         self.sigma = other.sigma
+
+
+def joined(blocks: Sequence[NormalEquations]) -> NormalEquations:
+    """All blocks as one."""
+    H = np.sum([block.H for block in blocks], axis=0)
+    g = np.sum([block.g for block in blocks], axis=0)
+    S = np.sum([block.S for block in blocks], axis=0)
+    return NormalEquations(H, g, S)
 
 
 def _weight(deviation: float | None) -> float:

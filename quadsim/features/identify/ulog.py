@@ -95,13 +95,16 @@ def stated_rotors(path: Path) -> str:
         return ""
     hubs = []
     moments = []
+    spins = []
     for i in _ROTORS:
         hubs.append([stated_number(path, stated, f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XYZ"])
-        moments.append(stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05))
+        moment = stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05)
+        moments.append(moment)
+        spins.append(-1 if moment > 0.0 else 1)
     positions = np.round(np.array(hubs) * HALF_TURN, 4) + 0.0  # never -0
     values = {
         "rotor_positions": (positions.tolist(), "m"),
-        "rotor_spins": ([-1 if moment > 0.0 else 1 for moment in moments], "-"),
+        "rotor_spins": (spins, "-"),
         "drag_to_thrust": (round(float(np.abs(moments).mean()), 4), "m"),
     }
     lines = []
