@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.features.identify.border import between, stated_number
+from quadsim.features.identify.border import scale_between, stated_number
 from quadsim.features.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.state import Array
@@ -100,7 +100,7 @@ def _quantities(path: Path, headers: Mapping[str, Any]) -> tuple[NamedQuantity, 
         logged_as("rates", "gyroADC[{}]", scale=np.radians(degrees)),
         logged_as("attitude", "imuQuaternion{}", each=".w [0] [1] [2]", scale=1.0 / _QUATERNION_SCALE),
         logged_as("specific_force", "accSmooth[{}]", scale=gravity),
-        logged_as("throttle", "motor[{}]", **between(path, "motorOutput", low, high)),
+        logged_as("throttle", "motor[{}]", **scale_between(path, "motorOutput", low, high)),
         logged_as("speeds", "eRPM[{}]", scale=rpm * RPM),
         logged_as("voltage", "vbatLatest", unit="cV"),
     )

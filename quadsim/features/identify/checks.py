@@ -1,8 +1,8 @@
 """What of a log can be used, and whether its columns are what they should be; before any fit.
 
-`spans` finds the parts in the air: on the ground, the rotors carry less than the weight while the vehicle rests.
-`check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one trusts what an
-earlier one saw.
+`airborne_spans` finds the parts in the air: on the ground, the rotors carry less than the weight while the vehicle
+rests.  `check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one trusts what
+an earlier one saw.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ AT_LIMIT: Final = 2e-3  # share of an output's range within which it is at a lim
 MOST_AT_LIMIT: Final = 0.2  # share of samples at a limit from which a note says so
 
 
-def spans(record: Record, vehicle: Vehicle) -> list[slice]:
+def airborne_spans(record: Record, vehicle: Vehicle) -> list[slice]:
     """Return the parts of a log in the air and without gaps, each 2 s or longer.
 
     Raises:

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.features.identify.border import between, stated_number
+from quadsim.features.identify.border import scale_between, stated_number
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.vehicle import N_ROTORS
@@ -123,4 +123,4 @@ def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
         columns.append(f"RCOU.C{output}")
     low = stated_number(path, parameters, "MOT_PWM_MIN", 0) or 1000.0  # 0: that of the radio
     high = stated_number(path, parameters, "MOT_PWM_MAX", 0) or 2000.0
-    return {"columns": tuple(columns), **between(path, "MOT_PWM_MIN and MAX", low, high)}
+    return {"columns": tuple(columns), **scale_between(path, "MOT_PWM_MIN and MAX", low, high)}

@@ -16,7 +16,7 @@ from quadsim.errors import InputError
 from quadsim.features.identify.disturbance import with_disturbance
 from quadsim.features.identify.estimate import VECTORS, FlightNumbers, Identification, number_in
 from quadsim.features.identify.judgement import DAMPING, JudgedFit, is_body
-from quadsim.features.identify.model import Stretch, mean_voltage, stretch
+from quadsim.features.identify.model import Segment, mean_voltage, prepare_segment
 from quadsim.features.identify.record import Record, part_of
 from quadsim.features.identify.rotor_response import RotorResponse, response_speeds, rotor_response
 from quadsim.features.identify.search import DRAG_AREAS, FLAT_BODY, Search
@@ -69,13 +69,13 @@ def identify_records(
     return with_disturbance(_result(judgement, refined), refined)
 
 
-def _flown(records: Sequence[Record], spans: Sequence[Sequence[slice]]) -> list[Stretch]:
-    """The stretches of all records that fly."""
+def _flown(records: Sequence[Record], spans: Sequence[Sequence[slice]]) -> list[Segment]:
+    """The segments of all records that fly."""
     flown = []
     for flight, (record, spans_of_record) in enumerate(zip(records, spans, strict=True)):
         for span in spans_of_record:
-            flown.append(stretch(part_of(record, span), flight))
-    if {part.flight for part in flown} != {*range(len(records))}:
+            flown.append(prepare_segment(part_of(record, span), flight))
+    if {segment.flight for segment in flown} != {*range(len(records))}:
         raise InputError("no part of the logs flies")
     logged = {(record.speeds is None, record.commands is None, record.voltage is None) for record in records}
     if len(logged) > 1:
@@ -84,14 +84,14 @@ def _flown(records: Sequence[Record], spans: Sequence[Sequence[slice]]) -> list[
     return flown
 
 
-def _with_instruments(flown: Sequence[Stretch], vehicle: Vehicle) -> tuple[dict[str, RotorResponse], list[Stretch]]:
-    """The rotors' response, and the stretches with the speeds that it and the commands predict."""
+def _with_instruments(flown: Sequence[Segment], vehicle: Vehicle) -> tuple[dict[str, RotorResponse], list[Segment]]:
+    """The rotors' response, and the segments with the speeds that it and the commands predict."""
     voltage = mean_voltage(flown)
     response = rotor_response(flown, vehicle, voltage)
     instrumented = []
-    for part in flown:
-        speeds = response_speeds(part, vehicle, voltage, response)
-        instrumented.append(replace(part, instrument_speeds=speeds))
+    for segment in flown:
+        speeds = response_speeds(segment, vehicle, voltage, response)
+        instrumented.append(replace(segment, instrument_speeds=speeds))
     return response, instrumented
 
 
@@ -146,8 +146,8 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
 def _flight_numbers(refined: Search, flight: int) -> FlightNumbers:
     """The numbers of a flight's own, its wind in the mean."""
     of_parts = []
-    for i, part in enumerate(refined.parts):
-        if part.flight == flight:
+    for i, segment in enumerate(refined.segments):
+        if segment.flight == flight:
             of_parts.append(refined.parameters(refined.x, i))
     wind = np.mean([parameters.wind.mean(axis=0) for parameters in of_parts], axis=0)
     return FlightNumbers(of_parts[0].delay, tuple(of_parts[0].offset.tolist()), tuple(wind.tolist()))

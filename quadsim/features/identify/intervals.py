@@ -124,10 +124,10 @@ def _flight_alone(blocks: Sequence[NormalEquations], whole: NormalEquations) -> 
 def _autocorrelation(search: Search) -> dict[str, float]:
     """Largest |autocorrelation| of each axis's innovations at lags up to `_LONGEST_LAG`."""
     largest = np.zeros(len(INCREMENTS))
-    for part, innovations in zip(search.parts, search.innovations(search.x), strict=True):
+    for segment, innovations in zip(search.segments, search.innovations(search.x), strict=True):
         e = innovations - innovations.mean(axis=0)
         variance = (e**2).mean(axis=0)
-        lags = max(1, round(_LONGEST_LAG / part.step))
+        lags = max(1, round(_LONGEST_LAG / segment.step))
         for lag in range(1, 1 + lags):
             largest = np.maximum(largest, np.abs((e[lag:] * e[:-lag]).mean(axis=0)) / variance)
     return dict(zip(INCREMENTS, np.minimum(largest, 0.99).tolist(), strict=True))

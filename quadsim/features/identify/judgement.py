@@ -117,11 +117,11 @@ class JudgedFit:
         self.search = search
         self.vehicle = search.vehicle
         self.intervals = Intervals(search)
-        record = search.parts[0].record
+        record = search.segments[0].record
         self.speeds_measured = record.speeds is not None
         self._throttle_only = record.speeds is None and record.commands is None
         self._gusts_turn = self._wind_makes_torque()
-        self._rotors_unknown = max(part.record.rotors_unknown for part in search.parts)
+        self._rotors_unknown = max(segment.record.rotors_unknown for segment in search.segments)
         self.refitted: set[str] = set()
         """Numbers that are refused and yet sought once more: where the log speaks against the start."""
         self.estimates = self._all_estimates(response)
@@ -309,14 +309,14 @@ class JudgedFit:
         return ""
 
     def _uncarried(self) -> float:
-        """Share of the weight that neither thrust nor drag carry, in the mean over all stretches."""
+        """Share of the weight that neither thrust nor drag carry, in the mean over all segments."""
         search = self.search
         lift_misfits = []
-        for i in range(len(search.parts)):
+        for i in range(len(search.segments)):
             misfit, _ = search.misfit(search.x, i)
             lift_misfits.append(misfit[:, -1])
         mean = float(np.concatenate(lift_misfits).mean())
-        return mean / (self.vehicle.gravity * search.parts[0].step)
+        return mean / (self.vehicle.gravity * search.segments[0].step)
 
     def _response_estimate(self, name: str, number: RotorResponse) -> ParameterEstimate:
         """A number of how the rotors respond, where the log has both speeds and commands."""

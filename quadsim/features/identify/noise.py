@@ -31,7 +31,7 @@ _SLOPE_STEP: Final = 1e-3  # for slopes of innovations by differences, in logari
 _FARTHEST: Final = 50.0  # largest logarithm of a deviation that the search tries, either way
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
 _REGULAR: Final = 1e-6 * np.eye(3)  # information without which a number that nothing shows has none
-_MEMORY: Final = 2000  # samples after which a stretch has forgotten the error of its first
+_MEMORY: Final = 2000  # samples after which a segment has forgotten the error of its first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,9 +110,9 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
     """Return the likeliest noise of an axis.
 
     Args:
-        misfits: (N,) of each stretch of the logs.
-        periods: between samples [s], of each stretch.
-        blocks: of each stretch, the samples of the parts that are left out in turn.
+        misfits: (N,) of each segment of the logs.
+        periods: between samples [s], of each segment.
+        blocks: of each segment, the samples of the parts that are left out in turn.
     """
     least = np.array([-_FARTHEST, math.log(SHORTEST_NOISE * periods[0]), -_FARTHEST])
     most = np.array([_FARTHEST, math.log(LONGEST_NOISE), _FARTHEST])

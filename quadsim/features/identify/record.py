@@ -18,9 +18,9 @@ from quadsim.errors import FileError, InputError
 from quadsim.features.identify import crazyflie, ulog
 from quadsim.features.identify.bags import read_bag
 from quadsim.features.identify.blackbox import read_blackbox
-from quadsim.features.identify.border import reading
+from quadsim.features.identify.border import reading_errors
 from quadsim.features.identify.dataflash import read_dataflash
-from quadsim.features.identify.inertial import filled_in, integrated_velocity, levelled_attitude
+from quadsim.features.identify.inertial import filled_velocity, integrated_velocity, levelled_attitude
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from quadsim.features.identify.sensors import (
     NORM_TOLERANCE,
@@ -28,7 +28,7 @@ from quadsim.features.identify.sensors import (
     without_spikes,
     without_stopped_counters,
 )
-from quadsim.features.identify.series import Column, held, interpolated
+from quadsim.features.identify.series import Column, interpolated, latest_samples
 from quadsim.features.identify.tables import read_columns
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array, Indices
@@ -75,7 +75,7 @@ FORMATS: Final = (
 class Record:
     """A flight as it was logged: N samples, uniform in time; world z up, body x forward, y left, z up.
 
-    Samples in gaps of the log are NaN; `quadsim.features.identify.checks.spans` leaves them out.
+    Samples in gaps of the log are NaN; `quadsim.features.identify.checks.airborne_spans` leaves them out.
     """
 
     name: str  # of the log, for messages and sources
@@ -160,7 +160,7 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
     name = file.name
     if name == FLIGHT_FILE:
         name = file.resolve().parent.name
-    with reading(file, kind.title, kind.library):
+    with reading_errors(file, kind.title, kind.library):
         log = kind.read(file, columns)
         series = to_series(file, log, columns, poles)
         record = to_record(name, series)
@@ -217,7 +217,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
     elif force is not None and velocity_period > SLOWEST_VELOCITY:
         by_force = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
-        values["velocity"] = filled_in(values["velocity"], by_force, round(2.0 * velocity_period / period))
+        values["velocity"] = filled_velocity(values["velocity"], by_force, round(2.0 * velocity_period / period))
         rate = 1.0 / velocity_period
         notes.append(f"{name}: the velocity is logged at {rate:.3g} Hz; the accelerometer fills it in")
     if voltage is not None:
@@ -225,7 +225,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         if there.any():
             values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     if fresh is not None:
-        fresh_rows, known_rotors = held(fresh, grid + STAMP_JITTER * period).T
+        fresh_rows, known_rotors = latest_samples(fresh, grid + STAMP_JITTER * period).T
         values["fresh"] = fresh_rows
         values["rotors_unknown"] = np.full(len(grid), 1.0 - known_rotors.mean())
     size = int(1.0 / (FASTEST_RATE * period))
@@ -238,7 +238,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         values["fresh"] = values["fresh"] > 0.0
         values["rotors_unknown"] = float(values["rotors_unknown"][0])
     if flying is not None:
-        values["flying"] = held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+        values["flying"] = latest_samples(Column(flying.t, flying.values[:, 0]), grid) > 0.5
     return Record(name=name, t=grid, notes=tuple(notes), inertial=inertial, **values)
 
 

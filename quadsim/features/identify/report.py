@@ -17,8 +17,8 @@ import numpy as np
 
 from quadsim.console.results import Shown, Tabular, after
 from quadsim.errors import InputError, MissingPackageError, ParameterError
-from quadsim.features.identify.border import judging
-from quadsim.features.identify.checks import check_log, spans
+from quadsim.features.identify.border import fitting_errors
+from quadsim.features.identify.checks import airborne_spans, check_log
 from quadsim.features.identify.estimate import DisturbanceEstimate, Identification, ParameterEstimate
 from quadsim.features.identify.fit import identify_records
 from quadsim.features.identify.identification_figures import (
@@ -277,7 +277,7 @@ def identify_logs(
         notes += log.notes
     _refuse_same_flights([*fitted, *tested])
     names = tuple(log.record.name for log in fitted)
-    with judging(", ".join(names)):
+    with fitting_errors(", ".join(names)):
         identification, prediction = _fit_and_predict(fitted, tested, start, vehicle, wind=wind)
     if prediction.lost and not anyway:
         file = None
@@ -349,8 +349,8 @@ def _usable(
     for path in paths:
         try:
             record = read_record(path, poles=poles, columns=columns)
-            with judging(record.name):
-                airborne = spans(record, vehicle)
+            with fitting_errors(record.name):
+                airborne = airborne_spans(record, vehicle)
                 notes = check_log(record, vehicle, airborne)
         except InputError as error:
             if isinstance(error, MissingPackageError) or not path.exists():

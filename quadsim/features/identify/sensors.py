@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label, maximum_filter1d, median_filter
 
 from quadsim.errors import InputError
-from quadsim.features.identify.series import Column, held, interpolated
+from quadsim.features.identify.series import Column, interpolated, latest_samples
 from quadsim.state import Array
 
 LONGEST_SPIKE: Final = 3  # samples, of which a log with a sample in `SPIKE_TIME` or more has one
@@ -301,7 +301,7 @@ def _has_to_turn(series: Mapping[str, Column], rotor: int, there: NDArray[np.boo
     turning = np.nan_to_num(others) > CARRYING * np.quantile(others[there], 0.9)
     commands = series.get("commands", series.get("throttle"))
     if commands is not None:
-        command = np.nan_to_num(held(commands, t)[:, rotor])
+        command = np.nan_to_num(latest_samples(commands, t)[:, rotor])
         lately = 2 * round(SLOWS_DOWN / float(np.median(np.diff(t)))) + 1
         turning &= maximum_filter1d(command, lately) > IDLE * command.max()
     return np.asarray(turning)

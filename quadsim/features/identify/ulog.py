@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.features.identify.border import between, reading, stated_number
+from quadsim.features.identify.border import reading_errors, scale_between, stated_number
 from quadsim.features.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
-from quadsim.features.identify.series import Column, held, on_one_clock
+from quadsim.features.identify.series import Column, latest_samples, on_one_clock
 from quadsim.vehicle import N_ROTORS
 
 ULOGS: Final = (".ulg", ".ulog")
@@ -89,7 +89,7 @@ def stated_rotors(path: Path) -> str:
     """
     if path.suffix.lower() not in ULOGS or not path.is_file():
         return ""
-    with reading(path, "ULog", "pyulog"):
+    with reading_errors(path, "ULog", "pyulog"):
         stated = _parsed(path, _STATES).initial_parameters
     if stated_number(path, stated, "CA_ROTOR_COUNT", 0, whole=True) != N_ROTORS:
         return ""
@@ -129,7 +129,7 @@ def _flying(columns: Mapping[str, Column]) -> Column | None:
     t = np.unique(np.concatenate([columns[name].t for name in known]))
     flying = np.ones(len(t), bool)
     for name in known:
-        flying &= held(columns[name], t) == flying_states[name]
+        flying &= latest_samples(columns[name], t) == flying_states[name]
     return Column(t, flying.astype(float))
 
 
@@ -149,4 +149,4 @@ def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
     low = [pulse(output, "MIN", 1000.0) for output in outputs]
     high = [pulse(output, "MAX", 2000.0) for output in outputs]
     columns = tuple(f"actuator_outputs.output[{output}]" for output in outputs)
-    return {"columns": columns, **between(path, "pulses of PWM_MAIN", low, high)}
+    return {"columns": columns, **scale_between(path, "pulses of PWM_MAIN", low, high)}
