@@ -163,11 +163,11 @@ def rotor_motion(record: Record, vehicle: Vehicle, p: Parameters) -> RotorMotion
     """The rotors' speeds, from whatever the record has of them."""
     if record.speeds is not None:
         return measured_rotors(record.speeds, record.period, delay=p.delay)
-    commands = commanded_speeds(record, vehicle, p)
+    commands = demanded_speeds(record, vehicle, p)
     return lagged_rotors(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
 
 
-def commanded_speeds(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
+def demanded_speeds(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
     """(N, 4) rotor speeds that the commands or the throttle demand [rad/s]."""
     if record.commands is not None:
         commands = record.commands

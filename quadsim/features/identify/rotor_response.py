@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
-from quadsim.features.identify.model import Parameters, Segment, commanded_speeds, voltages
+from quadsim.features.identify.model import Parameters, Segment, demanded_speeds, voltages
 from quadsim.features.identify.rotors import lagged_rotors, start_lag
 from quadsim.features.identify.series import interpolated
 from quadsim.state import Array
@@ -109,7 +109,7 @@ class _ResponseFit:
     def log_speed_ratios(self) -> Array:
         """(4,) logarithm of each rotor's mean speed over its mean command, in the first segment."""
         parameters = Parameters.of(self.vehicle, voltage=self.voltage)
-        commands = commanded_speeds(self.segments[0].record, self.vehicle, parameters)
+        commands = demanded_speeds(self.segments[0].record, self.vehicle, parameters)
         return np.asarray(np.log(self._speeds[0].mean(axis=0) / commands.mean(axis=0)))
 
     def errors(self, x: Array) -> Array:
@@ -125,7 +125,7 @@ class _ResponseFit:
         for segment, (slow, change) in zip(self.segments, self._slow, strict=True):
             samples = np.arange(len(slow))
             late = samples - delay / self.period - 0.5  # a command that is held is half a period late in the mean
-            commands = commanded_speeds(segment.record, self.vehicle, parameters)
+            commands = demanded_speeds(segment.record, self.vehicle, parameters)
             target = interpolated(late, samples, commands) * ratios
             left = slow + np.where(change > 0.0, rise, fall) * change
             error = left - sosfiltfilt(self._low_pass, target, axis=0)
@@ -137,7 +137,7 @@ def response_speeds(segment: Segment, vehicle: Vehicle, voltage: float, response
     """Speeds (N, 4) of a segment by its commands and a response; in the mean those that were measured [rad/s]."""
     numbers = {name: number.value for name, number in response.items()}
     p = Parameters.of(vehicle, voltage=voltage, **numbers)
-    commands = commanded_speeds(segment.record, vehicle, p)
+    commands = demanded_speeds(segment.record, vehicle, p)
     rotors = lagged_rotors(commands, segment.record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
     means = np.asarray(segment.record.speeds).mean(axis=0)
     return np.asarray(rotors.speeds * means / rotors.speeds.mean(axis=0))

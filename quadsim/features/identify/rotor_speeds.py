@@ -15,7 +15,7 @@ import numpy as np
 from scipy.signal import filtfilt
 
 from quadsim.errors import InputError
-from quadsim.features.identify.model import Parameters, commanded_speeds
+from quadsim.features.identify.model import Parameters, demanded_speeds
 from quadsim.features.identify.record import Record, in_parts
 from quadsim.features.identify.rotor_order import AGREEING, EXPLAINED, LAGS, explained_at_lag
 from quadsim.state import Array
@@ -41,7 +41,7 @@ def check_against_commands(record: Record, parts: Sequence[slice], vehicle: Vehi
         voltage = 0.0
     else:
         voltage = float(np.nanmean(record.voltage))
-    commands = commanded_speeds(record, vehicle, Parameters.of(vehicle, voltage=voltage))
+    commands = demanded_speeds(record, vehicle, Parameters.of(vehicle, voltage=voltage))
     speeds = in_parts(np.asarray(record.speeds), parts)
     targets = in_parts(commands, parts)
     if np.allclose(speeds, targets * (speeds.mean() / targets.mean()), rtol=1e-6):
