@@ -133,20 +133,23 @@ class JudgedFit:
 
     def held(self) -> dict[str, float]:
         """What the second search does not seek: numbers that a gate refuses, at what the file will say of them."""
-        held = {}
+        known = {*self.search.names, *self.search.fixed}
+        held = dict(self.search.fixed)
         for name, estimate in self.estimates.items():
             if not estimate.refused or name in self.refitted:
                 continue
-            if estimate.in_file:
-                held[name] = estimate.start or 0.0
-            elif name in ("delay", "lateness"):
-                held["delay"] = 0.0
-            elif name == "throttle_curve":
-                held[name] = self.vehicle.throttle_share
+            if name == "lateness":
+                parameter = "delay"
             else:
-                held[name] = 0.0
-        known = {*self.search.names, *self.search.fixed}
-        return {**self.search.fixed, **{name: held[name] for name in held if name in known}}
+                parameter = name
+            value = 0.0
+            if estimate.in_file:
+                value = estimate.start or 0.0
+            elif name == "throttle_curve":
+                value = self.vehicle.throttle_share
+            if parameter in known:
+                held[parameter] = value
+        return held
 
     def refuse_moved(self, refined: Search) -> dict[str, float]:
         """Judge the intervals that another search widened; return what is to be held since, as `held` does."""

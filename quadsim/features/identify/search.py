@@ -115,7 +115,12 @@ def _free_parameters(vehicle: Vehicle, segments: Sequence[Segment], *, wind: boo
 
 
 def _of_vehicle(vehicle: Vehicle) -> Iterator[FreeParameter]:
-    """Numbers of thrust, inertia, drag and torque."""
+    """Numbers of thrust, inertia, drag and torque.
+
+    Where the start has none, a number begins at a typical one: a rotor drag of 2 % of the weight per m/s, a body drag
+    of a quarter of the arm's square, 6e-4 of inertia_z for a rotor's.  Scales are what acts in hover at 1 m/s or 1
+    rad/s: moments of 1 % of weight times arm, a damping of inertia, an inflow that takes 2 % of the thrust.
+    """
     weight = vehicle.mass * vehicle.gravity
     arm = vehicle.longest_arm
     hover = vehicle.hover_speed
@@ -201,14 +206,14 @@ class Search:
         self.segments = segments
         self.vehicle = vehicle
         self.fixed = fixed or {}
-        every = _free_parameters(vehicle, segments, wind=wind)
-        self.free = [parameter for parameter in every if parameter.name not in self.fixed]
+        candidates = _free_parameters(vehicle, segments, wind=wind)
+        self.free = [parameter for parameter in candidates if parameter.name not in self.fixed]
         self.voltage = mean_voltage(segments)
         self.flight_count = 1 + segments[-1].flight
         self._free_count = len(self.free)
         reflections = [*_FIRST_REFLECTIONS] * len(INCREMENTS) * self.flight_count
         first_errors = np.zeros(len(INCREMENTS) * len(segments))
-        self._first_errors = self._free_count + len(reflections)  # where the errors of first samples begin in x
+        self._errors_begin = self._free_count + len(reflections)  # where the errors of first samples begin in x
         self.x = np.concatenate([np.zeros(self._free_count), reflections, first_errors])
         deviations = [parameter.deviation for parameter in self.free]
         deviations += [_REFLECTION_DEVIATION] * len(reflections)
@@ -287,13 +292,13 @@ class Search:
 
     def _first_error_place(self, index: int, axis: int) -> int:
         """Where in x the error of the first sample of an axis of a segment is."""
-        return self._first_errors + len(INCREMENTS) * index + axis
+        return self._errors_begin + len(INCREMENTS) * index + axis
 
     def _innovations_of_axis(self, misfit: Array, x: Array, index: int, axis: int) -> Array:
         """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less the error of its sample."""
-        driven = misfit[:, axis].copy()
-        driven[0] += x[self._first_error_place(index, axis)] * self.sigma[self.segments[index].flight, axis]
-        return self._filtered(driven, x, index, axis)
+        corrected = misfit[:, axis].copy()
+        corrected[0] += x[self._first_error_place(index, axis)] * self.sigma[self.segments[index].flight, axis]
+        return self._filtered(corrected, x, index, axis)
 
     def _innovations(self, misfit: Array, x: Array, index: int) -> Array:
         columns = [self._innovations_of_axis(misfit, x, index, axis) for axis in range(len(INCREMENTS))]
@@ -537,7 +542,7 @@ class Search:
         by_flight = self._by_flight(self.innovations(self.x))
         self.sigma = np.stack([np.sqrt((e**2).mean(axis=0)) for e in by_flight])
         flights = [segment.flight for segment in self.segments]
-        first_errors = self.x[self._first_errors :].reshape(-1, len(INCREMENTS))
+        first_errors = self.x[self._errors_begin :].reshape(-1, len(INCREMENTS))
         first_errors *= (before / self.sigma)[flights]
 
     def adopt(self, other: Search) -> None:
