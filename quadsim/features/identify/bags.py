@@ -1,6 +1,6 @@
 """Bags of ROS 1 and 2 (`.bag`, `.mcap`, `.db3`, or a directory), read by rosbags and a map of their columns.
 
-A reader as those of autopilots' formats: it gives `record` columns by name, each on the clock of its topic.
+A reader like those of the autopilots' formats: it gives `record` columns by name, each on the clock of its topic.
 """
 
 from __future__ import annotations

@@ -64,7 +64,11 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     if _samples(columns, "XKQ.Q1") < _samples(columns, "ATT.Roll"):  # the quaternion is logged more rarely
         columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
     motors = _motor_outputs(path, parameters)
-    quantities = [replace(named, **motors) if named.quantity == "throttle" else named for named in _NAMES]
+    quantities = []
+    for named in _NAMES:
+        if named.quantity == "throttle":
+            named = replace(named, **motors)
+        quantities.append(named)
     return LoggedColumns(columns=columns, quantities=quantities, advice=_ADVICE)
 
 
@@ -99,7 +103,8 @@ def _messages(path: Path, used: Collection[str]) -> tuple[dict[str, _Rows], dict
                 if instance_field and row[instance_field]:
                     name = f"{kind}[{row[instance_field]}]"
                 if name not in messages:
-                    messages[name] = _Rows([key for key, value in row.items() if isinstance(value, int | float)], [])
+                    numbers = [field for field, value in row.items() if isinstance(value, int | float)]
+                    messages[name] = _Rows(numbers, [])
                 rows = messages[name]
                 rows.values.append(tuple(row[field] for field in rows.fields))
             return messages, {**log.params}

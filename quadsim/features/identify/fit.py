@@ -145,12 +145,15 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
 
 def _flight_numbers(refined: Search, flight: int) -> FlightNumbers:
     """The numbers of a flight's own, its wind in the mean."""
-    of_parts = []
+    numbers = []
+    winds = []
     for i, segment in enumerate(refined.segments):
         if segment.flight == flight:
-            of_parts.append(refined.parameters(refined.x, i))
-    wind = np.mean([parameters.wind.mean(axis=0) for parameters in of_parts], axis=0)
-    return FlightNumbers(of_parts[0].delay, tuple(of_parts[0].offset.tolist()), tuple(wind.tolist()))
+            parameters = refined.parameters(refined.x, i)
+            numbers.append(parameters)
+            winds.append(parameters.wind.mean(axis=0))
+    wind = np.mean(winds, axis=0)
+    return FlightNumbers(numbers[0].delay, tuple(numbers[0].offset.tolist()), tuple(wind.tolist()))
 
 
 def _vehicle(judgement: JudgedFit, values: Mapping[str, float]) -> Vehicle:

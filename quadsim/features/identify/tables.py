@@ -1,6 +1,6 @@
 """Tables as logs: CSV, Parquet, and quadsim's own `flight.parquet`, their columns by the names that are in use.
 
-A reader as those of autopilots' formats: it gives `record` columns by name, all on the clock of the table's rows.
+A reader like those of the autopilots' formats: it gives `record` columns by name, all on the clock of the table's rows.
 """
 
 from __future__ import annotations

@@ -139,14 +139,18 @@ def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
     for i in range(2 * N_ROTORS):
         function = stated_number(path, parameters, f"PWM_MAIN_FUNC{i + 1}", 0, whole=True)
         outputs_by_motor[function - _FIRST_MOTOR] = i
-    outputs = [outputs_by_motor.get(motor, motor) for motor in _ROTORS]
 
     def pulse(output: int, end: str, usual: float) -> float:
         names = (f"PWM_MAIN_{end}{output + 1}", f"PWM_MAIN_{end}", f"PWM_{end}")
         stated = [stated_number(path, parameters, name, -1.0) for name in names]
         return next((number for number in stated if number >= 0.0), usual)
 
-    low = [pulse(output, "MIN", 1000.0) for output in outputs]
-    high = [pulse(output, "MAX", 2000.0) for output in outputs]
-    columns = tuple(f"actuator_outputs.output[{output}]" for output in outputs)
-    return {"columns": columns, **scale_between(path, "pulses of PWM_MAIN", low, high)}
+    columns = []
+    low = []
+    high = []
+    for motor in _ROTORS:
+        output = outputs_by_motor.get(motor, motor)
+        columns.append(f"actuator_outputs.output[{output}]")
+        low.append(pulse(output, "MIN", 1000.0))
+        high.append(pulse(output, "MAX", 2000.0))
+    return {"columns": tuple(columns), **scale_between(path, "pulses of PWM_MAIN", low, high)}
