@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.features.identify.border import scale_between, stated_number
+from quadsim.features.identify.log_errors import scale_between, stated_number
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.vehicle import N_ROTORS

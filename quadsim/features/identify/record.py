@@ -18,9 +18,9 @@ from quadsim.errors import FileError, InputError
 from quadsim.features.identify import crazyflie, ulog
 from quadsim.features.identify.bags import read_bag
 from quadsim.features.identify.blackbox import read_blackbox
-from quadsim.features.identify.border import reading_errors
 from quadsim.features.identify.dataflash import read_dataflash
 from quadsim.features.identify.inertial import filled_velocity, integrated_velocity, levelled_attitude
+from quadsim.features.identify.log_errors import reading_errors
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from quadsim.features.identify.sensors import (
     NORM_TOLERANCE,

@@ -17,7 +17,6 @@ import numpy as np
 
 from quadsim.console.results import Shown, Tabular, after
 from quadsim.errors import InputError, MissingPackageError, ParameterError
-from quadsim.features.identify.border import fitting_errors
 from quadsim.features.identify.checks import airborne_spans, check_log
 from quadsim.features.identify.estimate import DisturbanceEstimate, Identification, ParameterEstimate
 from quadsim.features.identify.fit import identify_records
@@ -27,6 +26,7 @@ from quadsim.features.identify.identification_figures import (
     residual_figure,
     trace_figure,
 )
+from quadsim.features.identify.log_errors import fitting_errors
 from quadsim.features.identify.prediction import (
     HORIZONS,
     JUDGED,

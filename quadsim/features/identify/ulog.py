@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.features.identify.border import reading_errors, scale_between, stated_number
+from quadsim.features.identify.log_errors import reading_errors, scale_between, stated_number
 from quadsim.features.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, latest_samples, on_one_clock
 from quadsim.vehicle import N_ROTORS

@@ -15,8 +15,8 @@ from flown_logs import COLUMNS, fly_eight, write_log
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, InputError
-from quadsim.features.identify.border import fitting_errors, reading_errors, scale_between, stated_number
 from quadsim.features.identify.checks import airborne_spans
+from quadsim.features.identify.log_errors import fitting_errors, reading_errors, scale_between, stated_number
 from quadsim.features.identify.quantities import read_map
 from quadsim.features.identify.record import read_record
 from quadsim.features.identify.report import identify_logs
