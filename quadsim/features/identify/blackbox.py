@@ -30,7 +30,7 @@ _BITS_OF_ONE: Final = int.from_bytes(struct.pack(">f", 1.0))  # a header states 
 _LARGEST_GYRO_SCALE: Final = 1e3  # of a gyro's unit [deg/s]
 
 
-def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_blackbox(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the columns of a Blackbox log by their names in it; of several in one file, the longest.
 
     Of its quaternion a log has x, y, z; w is not negative.

@@ -44,14 +44,14 @@ _FIRST_MOTOR: Final = 33  # of SERVOn_FUNCTION
 _OUTPUTS: Final = 16
 
 
-def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_dataflash(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the messages that are used: columns `MESSAGE.Field`, of the second instance on `MESSAGE[1].Field`.
 
     Raises:
         FileError: it is not a dataflash log, or has a parameter that says nothing.
     """
     used = set()
-    for named in (*given, *_NAMES):
+    for named in (*column_map, *_NAMES):
         used |= {column.partition(".")[0].partition("[")[0] for column in named.columns}
     messages, parameters = _messages(path, used)
     columns: dict[str, Column] = {}

@@ -249,17 +249,17 @@ class JudgedFit:
         return False
 
     def _all_estimates(self, response: Mapping[str, RotorResponse]) -> dict[str, ParameterEstimate]:
-        found = {}
+        estimates = {}
         for name, places in self._places().items():
-            found[name] = self._estimate(name, places)
+            estimates[name] = self._estimate(name, places)
         for name, number in response.items():
-            found[name] = self._response_estimate(name, number)
-        if "rotor_rise" not in found:
+            estimates[name] = self._response_estimate(name, number)
+        if "rotor_rise" not in estimates:
             fault = "the log has the rotors' speeds but not their commands"
             lag = self.vehicle.rotor_rise or 0.0
             for name in ("rotor_rise", "rotor_fall"):
-                found[name] = self._judged(name, lag, (lag, lag), fault)
-        return self._judged_together(found)
+                estimates[name] = self._judged(name, lag, (lag, lag), fault)
+        return self._judged_together(estimates)
 
     def _estimate(self, name: str, places: Sequence[int]) -> ParameterEstimate:
         """One number, or the mean of those of each flight with an interval that holds each."""
@@ -350,38 +350,38 @@ class JudgedFit:
             in_file=in_file,
         )
 
-    def _judged_together(self, found: dict[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+    def _judged_together(self, estimates: dict[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
         """Refuse what cannot be told without a number that is refused."""
 
         def refuse(name: str, fault: str, advice: str) -> None:
-            found[name] = replace(found[name], refused=fault, advice=advice)
+            estimates[name] = replace(estimates[name], refused=fault, advice=advice)
 
-        lags = [name for name in ("rotor_rise", "rotor_fall") if found[name].refused]
+        lags = [name for name in ("rotor_rise", "rotor_fall") if estimates[name].refused]
         if lags and not self.speeds_measured:
             unknown = " and ".join(lags)
             fault = f"{unknown} tell nothing, and no lag can be told from inertia without the rotors' speeds"
             for name in ("inertia_x", "inertia_y", "inertia_z"):
-                if not found[name].refused:
+                if not estimates[name].refused:
                     refuse(name, fault, _LOG_SPEEDS)
         if self._throttle_only:
             highest = f"{self.vehicle.speed_max:g} rad/s"
             fault = f"a log of the throttle shows it only for the highest speed of {highest}, kept"
             for name in _SCALED_BY_SPEED:
-                if name in found:  # it is not where it was held, as below 0
+                if name in estimates:  # it is not where it was held, as below 0
                     refuse(name, fault, _LOG_SPEEDS)
             self.refitted |= {*_SCALED_BY_SPEED}
         inertia = []
         for name in ("inertia_x", "inertia_y", "inertia_z"):
-            estimate = found[name]
+            estimate = estimates[name]
             inertia.append(estimate.start if estimate.refused and estimate.start else estimate.value)
-        if not found["inertia_z"].refused and not is_body(inertia):
+        if not estimates["inertia_z"].refused and not is_body(inertia):
             fault = f"no body has it beside {inertia[0]:.4g} and {inertia[1]:.4g} about x and y"
             refuse("inertia_z", fault, _TURNS)
-        if found["inertia_z"].refused and self._knows_yaw_acceleration():
+        if estimates["inertia_z"].refused and self._knows_yaw_acceleration():
             fault = "only the yaw acceleration that it gives is identified, with inertia_z as kept"
             refuse("drag_to_thrust", fault, _TURNS)
             self.refitted.add("drag_to_thrust")
-        return _in_order(found)
+        return _in_order(estimates)
 
     def _knows_yaw_acceleration(self) -> bool:
         """Whether d b / J_z, drag to thrust times thrust over inertia, is known where none of them may be."""

@@ -154,32 +154,32 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
     unknown = sorted({*table} - {*defaults})
     if unknown:
         raise FileError(path, f"{quantity} has no {unknown[0]!r}; its fields are {fields}")
-    given = defaults | table
-    for field, rule in _broken_rules(LOGGED[quantity], given):
-        raise FileError(path, f"{quantity}.{field} must be {rule}; got {given[field]!r:.80}")
-    zero, scale = units[given["unit"]]
+    entry = defaults | table
+    for field, rule in _broken_rules(LOGGED[quantity], entry):
+        raise FileError(path, f"{quantity}.{field} must be {rule}; got {entry[field]!r:.80}")
+    zero, scale = units[entry["unit"]]
     return NamedQuantity(
         quantity=quantity,
-        columns=tuple(given["columns"]),
+        columns=tuple(entry["columns"]),
         zero=zero,
         scale=scale,
-        sign=tuple(map(float, given["sign"])),
-        down=frames is not None and given["frame"] == frames[1],
+        sign=tuple(map(float, entry["sign"])),
+        down=frames is not None and entry["frame"] == frames[1],
     )
 
 
-def _broken_rules(quantity: Quantity, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _broken_rules(quantity: Quantity, entry: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """The fields of a map's table that are not as they should be, and what they should be."""
     size, units, frames = quantity
-    names = given["columns"]
+    names = entry["columns"]
     if not _has_size(names, size) or not all(isinstance(name, str) for name in names):
         yield "columns", f"a list of {size} name{'s' * (size > 1)}"
-    if given["unit"] not in [*units]:
+    if entry["unit"] not in [*units]:
         yield "unit", f"one of {', '.join(map(repr, units))}"
-    signs = given["sign"]
+    signs = entry["sign"]
     if not _has_size(signs, size) or not all(sign in (1, -1) for sign in signs):
         yield "sign", f"a list of {size} of 1 and -1"
-    if frames and given["frame"] not in frames:
+    if frames and entry["frame"] not in frames:
         yield "frame", f"one of {', '.join(map(repr, frames))}"
 
 
@@ -188,21 +188,21 @@ def _has_size(values: Any, size: int) -> bool:
 
 
 def to_series(
-    path: Path, log: LoggedColumns, given: Sequence[NamedQuantity] = (), poles: int | None = None
+    path: Path, log: LoggedColumns, column_map: Sequence[NamedQuantity] = (), poles: int | None = None
 ) -> dict[str, Column]:
     """Return the series of a log by field of `quadsim.features.identify.record.Record`, in our units and frames.
 
     Args:
         path: of the log, for messages.
         log: what it has.
-        given: the map of its user, which comes before its own names.
+        column_map: the map of its user, which comes before its own names.
         poles: magnets of each motor, where the log has electrical speeds.
 
     Raises:
         FileError: a column is missing; the message names what is allowed.
         InputError: a sample or a unit cannot be meant, or poles are missing.
     """
-    named = _named_quantities(path, log, given)
+    named = _named_quantities(path, log, column_map)
     for quantity in named.values():
         _check_samples(path.name, log.columns, quantity)
     series = {}
@@ -227,15 +227,15 @@ def to_series(
     return series
 
 
-def _named_quantities(path: Path, log: LoggedColumns, given: Sequence[NamedQuantity]) -> dict[str, NamedQuantity]:
+def _named_quantities(path: Path, log: LoggedColumns, column_map: Sequence[NamedQuantity]) -> dict[str, NamedQuantity]:
     """The quantities of which a log has the columns, by the map first; refuse a log that lacks one that is needed."""
-    for quantity in given:
+    for quantity in column_map:
         missing = [column for column in quantity.columns if column not in log.columns]
         if missing:
             what = f"{quantity.quantity}.columns names {', '.join(map(repr, missing))}"
             raise FileError(path, f"lacks what the map's {what}; it has {listed(log.columns)}")
     named: dict[str, NamedQuantity] = {}
-    for quantity in (*given, *log.quantities):
+    for quantity in (*column_map, *log.quantities):
         if {*quantity.columns} <= {*log.columns}:
             named.setdefault(quantity.quantity, quantity)
     for what, alternatives in _NEEDED.items():

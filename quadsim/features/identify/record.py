@@ -146,17 +146,17 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         MissingPackageError: its format needs a library that is not installed.
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
-    given = Path(path)
-    is_bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
-    if given.is_dir() and not is_bag:
-        file = given / FLIGHT_FILE
+    location = Path(path)
+    is_bag = (location / "metadata.yaml").is_file()  # of ROS 2, a directory
+    if location.is_dir() and not is_bag:
+        file = location / FLIGHT_FILE
     else:
-        file = given
+        file = location
     if not (file.is_file() or is_bag):
-        raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
+        raise FileError(location, "has no flight.parquet" if location.is_dir() else "is missing, or not a file")
     kind = _format_of(file)
     if kind.read is not read_columns and any(named.quantity == "t" for named in columns):
-        raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
+        raise InputError(f"{location.name}: has a clock of its own; leave [t] out of the map")
     name = file.name
     if name == FLIGHT_FILE:
         name = file.resolve().parent.name

@@ -391,8 +391,8 @@ def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell
     else:
         start = f"{estimate.start:.4g}"
     value = f"{rounded(estimate.value, estimate):.7g}"
-    found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
-    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), found)
+    judged = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
+    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), judged)
 
 
 def _disturbance(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:

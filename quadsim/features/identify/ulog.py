@@ -42,14 +42,14 @@ _ADVICE: Final = "set SDLOG_PROFILE to 17, the default set and the high rate"
 _FIRST_MOTOR: Final = 101  # of PWM_MAIN_FUNCn
 
 
-def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_ulog(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the topics of a ULog that are used: columns `topic.field`, each on the clock of its measurement.
 
     Raises:
         FileError: a parameter of it says nothing.
     """
     topics = [*_STATES]
-    for named in (*given, *_NAMES):
+    for named in (*column_map, *_NAMES):
         topics += [column.partition(".")[0] for column in named.columns]
     log = _parsed(path, topics)
     columns: dict[str, Column] = {}
