@@ -16,7 +16,7 @@ import numpy as np
 
 from quadsim.errors import FileError
 from quadsim.features.identify.log_errors import scale_between, stated_number
-from quadsim.features.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
+from quadsim.features.identify.quantities import RPM, STANDARD_GRAVITY, LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.state import Array
 
@@ -24,7 +24,6 @@ _ADVICE: Final = (
     "in Betaflight, set blackbox_disable_attitude, _acc, _rpm and _gyro to OFF, blackbox_sample_rate to 1/8"
 )
 _QUATERNION_SCALE: Final = 32767.0  # 1 in a component of the quaternion
-_STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 _USUAL_POLES: Final = 14  # of a motor
 _BITS_OF_ONE: Final = int.from_bytes(struct.pack(">f", 1.0))  # a header states a float by its bits
 _LARGEST_GYRO_SCALE: Final = 1e3  # of a gyro's unit [deg/s]
@@ -95,7 +94,7 @@ def _quantities(path: Path, headers: Mapping[str, Any]) -> tuple[NamedQuantity, 
     low, high = (stated_number(path, {"motorOutput": end}, "motorOutput", math.nan) for end in ends)
     poles = stated_number(path, headers, "motor_poles", _USUAL_POLES, low=2, high=200, whole=True)
     rpm = 100.0 / (0.5 * poles)  # of 100 electrical ones
-    gravity = _STANDARD_GRAVITY / stated_number(path, headers, "acc_1G", 2048, low=1)
+    gravity = STANDARD_GRAVITY / stated_number(path, headers, "acc_1G", 2048, low=1)
     return (
         logged_as("rates", "gyroADC[{}]", scale=np.radians(degrees)),
         logged_as("attitude", "imuQuaternion{}", each=".w [0] [1] [2]", scale=1.0 / _QUATERNION_SCALE),

@@ -25,7 +25,7 @@ NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
 _MOST_LISTED: Final = 40  # names in a message
 _DEGREE: Final = math.pi / 180.0
-_STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
+STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 # Zero and scale of units: (logged - zero) * scale in ours.
 _LENGTHS: Final = {"m": (0.0, 1.0), "cm": (0.0, 0.01), "mm": (0.0, 1e-3)}
 _VELOCITIES: Final = {"m/s": (0.0, 1.0), "cm/s": (0.0, 0.01), "mm/s": (0.0, 1e-3), "km/h": (0.0, 1 / 3.6)}
@@ -51,7 +51,7 @@ LOGGED: Final = {
     "velocity": Quantity(3, _VELOCITIES, _WORLDS),
     "specific_force": Quantity(
         3,
-        {"m/s^2": (0.0, 1.0), "g": (0.0, _STANDARD_GRAVITY), "g/2048": (0.0, _STANDARD_GRAVITY / 2048)},
+        {"m/s^2": (0.0, 1.0), "g": (0.0, STANDARD_GRAVITY), "g/2048": (0.0, STANDARD_GRAVITY / 2048)},
         _BODIES,
     ),
     "attitude": Quantity(4, {"-": (0.0, 1.0)}, _WORLDS_AND_BODIES),

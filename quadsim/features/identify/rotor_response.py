@@ -17,14 +17,13 @@ from scipy.signal import butter, sosfiltfilt
 
 from quadsim.features.identify.model import Parameters, Segment, demanded_speeds, voltages
 from quadsim.features.identify.rotors import lagged_rotors, start_lag
+from quadsim.features.identify.search import MIN_BLOCKS, SHORTEST_BLOCK
 from quadsim.features.identify.series import interpolated
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 CORNER: Final = 6.0  # [Hz], a tenth of the log's rate if that is less
 _EDGE: Final = 0.5  # [s] at the ends of a segment that the filter disturbs
-_BLOCK: Final = 3.0  # [s] that are left out in turn
-_MIN_BLOCKS: Final = 6
 _LEAST_SAG: Final = 0.005  # share of the voltage that it must change by to show what it does
 _DELAY: Final = 2  # place of the delay in x, behind the two lags
 _PERIOD_DEVIATION: Final = 0.25  # of the delay, in periods: a log does not tell when in a period a command comes
@@ -60,7 +59,7 @@ def rotor_response(segments: Sequence[Segment], vehicle: Vehicle, voltage: float
         solution = least_squares(lambda x: fit.errors(x).ravel(), solution.x, x_scale=scales)
     e = fit.errors(solution.x)
     J = solution.jac.reshape(len(e), N_ROTORS, -1)
-    blocks = np.array_split(np.arange(len(e)), max(_MIN_BLOCKS, round(len(e) * period / _BLOCK)))
+    blocks = np.array_split(np.arange(len(e)), max(MIN_BLOCKS, round(len(e) * period / SHORTEST_BLOCK)))
     H = np.array([np.einsum("kri,krj->ij", J[rows], J[rows]) for rows in blocks])
     g = np.array([np.einsum("kri,kr->i", J[rows], e[rows]) for rows in blocks])
     H[:, _DELAY, _DELAY] += float("delay" in fit.held)  # on which nothing depends then
