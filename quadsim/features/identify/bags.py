@@ -1,6 +1,6 @@
 """Bags of ROS 1 and 2 (`.bag`, `.mcap`, `.db3`, or a directory), read by rosbags and a map of their columns.
 
-A reader as those of autopilots' formats: it gives `record` columns by name, each on the clock of its topic.
+A reader like those of the autopilots' formats: it gives `record` columns by name, each on the clock of its topic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from quadsim.features.identify.series import Column, on_one_clock
 _FIELD_OR_INDEX: Final = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
 
 
-def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_bag(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the columns of a bag that a map names: `/topic.field.x` or `/topic.field[0]`.
 
     Each is on the clock of its topic: of the headers of its messages, or of their arrival where they have none.
@@ -28,10 +28,10 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         FileError: it has no message with such a field.
         InputError: there is no map.
     """
-    if not given:
+    if not column_map:
         raise InputError(f"{path.name}: a bag names no quantities: give --columns, a map of its topics")
     names_by_topic: dict[str, list[str]] = {}
-    for named in given:
+    for named in column_map:
         for name in named.columns:
             names = names_by_topic.setdefault(name.partition(".")[0], [])
             if name not in names:
@@ -48,7 +48,7 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
             if rows:
                 times, *values = np.array(rows, float).T
                 columns |= on_one_clock(times, dict(zip(names, values, strict=True)))
-    return LoggedColumns(columns=columns, quantities=given)
+    return LoggedColumns(columns=columns, quantities=column_map)
 
 
 def _rows(path: Path, bag: Any, topic: str, names: Sequence[str]) -> list[list[float]]:

@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.features.identify.border import between, stated_number
-from quadsim.features.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
+from quadsim.features.identify.log_errors import scale_between, stated_number
+from quadsim.features.identify.quantities import RPM, STANDARD_GRAVITY, LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.state import Array
 
@@ -24,13 +24,12 @@ _ADVICE: Final = (
     "in Betaflight, set blackbox_disable_attitude, _acc, _rpm and _gyro to OFF, blackbox_sample_rate to 1/8"
 )
 _QUATERNION_SCALE: Final = 32767.0  # 1 in a component of the quaternion
-_STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 _USUAL_POLES: Final = 14  # of a motor
 _BITS_OF_ONE: Final = int.from_bytes(struct.pack(">f", 1.0))  # a header states a float by its bits
 _LARGEST_GYRO_SCALE: Final = 1e3  # of a gyro's unit [deg/s]
 
 
-def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_blackbox(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the columns of a Blackbox log by their names in it; of several in one file, the longest.
 
     Of its quaternion a log has x, y, z; w is not negative.
@@ -95,12 +94,12 @@ def _quantities(path: Path, headers: Mapping[str, Any]) -> tuple[NamedQuantity, 
     low, high = (stated_number(path, {"motorOutput": end}, "motorOutput", math.nan) for end in ends)
     poles = stated_number(path, headers, "motor_poles", _USUAL_POLES, low=2, high=200, whole=True)
     rpm = 100.0 / (0.5 * poles)  # of 100 electrical ones
-    gravity = _STANDARD_GRAVITY / stated_number(path, headers, "acc_1G", 2048, low=1)
+    gravity = STANDARD_GRAVITY / stated_number(path, headers, "acc_1G", 2048, low=1)
     return (
         logged_as("rates", "gyroADC[{}]", scale=np.radians(degrees)),
         logged_as("attitude", "imuQuaternion{}", each=".w [0] [1] [2]", scale=1.0 / _QUATERNION_SCALE),
         logged_as("specific_force", "accSmooth[{}]", scale=gravity),
-        logged_as("throttle", "motor[{}]", **between(path, "motorOutput", low, high)),
+        logged_as("throttle", "motor[{}]", **scale_between(path, "motorOutput", low, high)),
         logged_as("speeds", "eRPM[{}]", scale=rpm * RPM),
         logged_as("voltage", "vbatLatest", unit="cV"),
     )

@@ -1,8 +1,8 @@
 """What of a log can be used, and whether its columns are what they should be; before any fit.
 
-`spans` finds the parts in the air: on the ground, the rotors carry less than the weight while the vehicle rests.
-`check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one trusts what an
-earlier one saw.
+`airborne_spans` finds the parts in the air: on the ground, the rotors carry less than the weight while the vehicle
+rests.  `check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one trusts what
+an earlier one saw.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from quadsim.errors import InputError
 from quadsim.features.identify.axes import check_rate_axes, check_tilt, check_velocity_axes
 from quadsim.features.identify.clocks import check_clocks
 from quadsim.features.identify.quantities import RPM
-from quadsim.features.identify.record import HELD_INPUTS, ROTOR_INPUTS, SLOWEST_COMMANDS, Record, rotor_inputs
+from quadsim.features.identify.record import HELD_INPUTS, ROTOR_INPUTS, SLOWEST_COMMANDS, Record, in_parts, rotor_inputs
 from quadsim.features.identify.rotor_order import check_rotor_order
 from quadsim.features.identify.rotor_speeds import check_against_commands, check_against_each_other, check_not_commands
 from quadsim.features.identify.scales import check_scales
@@ -59,7 +59,7 @@ AT_LIMIT: Final = 2e-3  # share of an output's range within which it is at a lim
 MOST_AT_LIMIT: Final = 0.2  # share of samples at a limit from which a note says so
 
 
-def spans(record: Record, vehicle: Vehicle) -> list[slice]:
+def airborne_spans(record: Record, vehicle: Vehicle) -> list[slice]:
     """Return the parts of a log in the air and without gaps, each 2 s or longer.
 
     Raises:
@@ -294,7 +294,7 @@ def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
         rows = getattr(record, field)
         if rows is None:
             continue
-        flown = np.concatenate([rows[part] for part in parts])
+        flown = in_parts(rows, parts)
         low = flown.min()
         high = flown.max()
         near = AT_LIMIT * (high - low)

@@ -39,7 +39,7 @@ _NAMES: Final = (
 _ADVICE: Final = "in config.txt of the card, log stateEstimate.qw .. qz, vx .. vz, gyro, pwm and rpm at 100 Hz or more"
 
 
-def read_crazyflie(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_crazyflie(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read every variable of the log, by its name, each on the clock of its event type."""
     data = path.read_bytes()
     content = data[:-4]

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.features.identify.border import between, stated_number
+from quadsim.features.identify.log_errors import scale_between, stated_number
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.vehicle import N_ROTORS
@@ -44,14 +44,14 @@ _FIRST_MOTOR: Final = 33  # of SERVOn_FUNCTION
 _OUTPUTS: Final = 16
 
 
-def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_dataflash(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the messages that are used: columns `MESSAGE.Field`, of the second instance on `MESSAGE[1].Field`.
 
     Raises:
         FileError: it is not a dataflash log, or has a parameter that says nothing.
     """
     used = set()
-    for named in (*given, *_NAMES):
+    for named in (*column_map, *_NAMES):
         used |= {column.partition(".")[0].partition("[")[0] for column in named.columns}
     messages, parameters = _messages(path, used)
     columns: dict[str, Column] = {}
@@ -64,7 +64,11 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     if _samples(columns, "XKQ.Q1") < _samples(columns, "ATT.Roll"):  # the quaternion is logged more rarely
         columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
     motors = _motor_outputs(path, parameters)
-    quantities = [replace(named, **motors) if named.quantity == "throttle" else named for named in _NAMES]
+    quantities = []
+    for named in _NAMES:
+        if named.quantity == "throttle":
+            named = replace(named, **motors)
+        quantities.append(named)
     return LoggedColumns(columns=columns, quantities=quantities, advice=_ADVICE)
 
 
@@ -99,7 +103,8 @@ def _messages(path: Path, used: Collection[str]) -> tuple[dict[str, _Rows], dict
                 if instance_field and row[instance_field]:
                     name = f"{kind}[{row[instance_field]}]"
                 if name not in messages:
-                    messages[name] = _Rows([key for key, value in row.items() if isinstance(value, int | float)], [])
+                    numbers = [field for field, value in row.items() if isinstance(value, int | float)]
+                    messages[name] = _Rows(numbers, [])
                 rows = messages[name]
                 rows.values.append(tuple(row[field] for field in rows.fields))
             return messages, {**log.params}
@@ -123,4 +128,4 @@ def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
         columns.append(f"RCOU.C{output}")
     low = stated_number(path, parameters, "MOT_PWM_MIN", 0) or 1000.0  # 0: that of the radio
     high = stated_number(path, parameters, "MOT_PWM_MAX", 0) or 2000.0
-    return {"columns": tuple(columns), **between(path, "MOT_PWM_MIN and MAX", low, high)}
+    return {"columns": tuple(columns), **scale_between(path, "MOT_PWM_MIN and MAX", low, high)}

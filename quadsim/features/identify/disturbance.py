@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 
 from quadsim.features.identify.estimate import DisturbanceEstimate, Identification
 from quadsim.features.identify.intervals import student_quantile
-from quadsim.features.identify.model import INCREMENTS, Stretch
+from quadsim.features.identify.model import INCREMENTS, Segment
 from quadsim.features.identify.noise import NoiseFit, identify_noise
 from quadsim.features.identify.search import Search
 from quadsim.state import Array
@@ -31,13 +31,13 @@ _LONGEST_DECAY: Final = 100.0  # time constant of rates that do not decay [s]
 
 def with_disturbance(identification: Identification, search: Search) -> Identification:
     """Return an identification with the torque and force that its search leaves over; wind's changes are a force."""
-    stretches = range(len(search.parts))
+    segments = range(len(search.segments))
     steady = search.in_steady_wind(search.x)
-    misfits = [search.misfit(steady, i)[0] for i in stretches]
-    periods = [part.step for part in search.parts]
-    blocks = [search.rows(i) for i in stretches]
+    misfits = [search.misfit(steady, i)[0] for i in segments]
+    periods = [segment.step for segment in search.segments]
+    blocks = [search.rows(i) for i in segments]
     shortest = 2.0 * periods[0]
-    is_inertial = any(part.record.inertial for part in search.parts)
+    is_inertial = any(segment.record.inertial for segment in search.segments)
     noise = []
     disturbance = []
     for place in range(len(INCREMENTS)):
@@ -48,7 +48,7 @@ def with_disturbance(identification: Identification, search: Search) -> Identifi
         else:
             disturbance.append(_force(place - 3, fit, identification, shortest, inertial=is_inertial))
     return replace(
-        identification, noise=tuple(noise), disturbance=tuple(disturbance), rates_last=_decay_time(search.parts)
+        identification, noise=tuple(noise), disturbance=tuple(disturbance), rates_last=_decay_time(search.segments)
     )
 
 
@@ -116,14 +116,14 @@ def _estimate(
     )
 
 
-def _decay_time(parts: Sequence[Stretch]) -> float:
+def _decay_time(segments: Sequence[Segment]) -> float:
     """Time constant [s] with which decaying rates predict themselves best, by least squares over `_DECAY_HORIZONS`."""
     products = np.zeros(len(_DECAY_HORIZONS))
     squares = np.zeros(len(_DECAY_HORIZONS))
-    for part in parts:
-        rates = part.record.rates
+    for segment in segments:
+        rates = segment.record.rates
         for i, horizon in enumerate(_DECAY_HORIZONS):
-            later = max(1, round(horizon / part.record.period))
+            later = max(1, round(horizon / segment.record.period))
             products[i] += float((rates[later:] * rates[:-later]).sum())
             squares[i] += float(np.square(rates[:-later]).sum())
 
@@ -131,5 +131,5 @@ def _decay_time(parts: Sequence[Stretch]) -> float:
         decay = np.exp(-np.array(_DECAY_HORIZONS) / math.exp(log_time))
         return float(squares @ decay**2 - 2.0 * products @ decay)
 
-    bounds = (math.log(parts[0].record.period), math.log(_LONGEST_DECAY))
+    bounds = (math.log(segments[0].record.period), math.log(_LONGEST_DECAY))
     return math.exp(float(minimize_scalar(error, bounds=bounds, method="bounded").x))

@@ -16,7 +16,7 @@ from quadsim.errors import InputError
 from quadsim.features.identify.disturbance import with_disturbance
 from quadsim.features.identify.estimate import VECTORS, FlightNumbers, Identification, number_in
 from quadsim.features.identify.judgement import DAMPING, JudgedFit, is_body
-from quadsim.features.identify.model import Stretch, mean_voltage, stretch
+from quadsim.features.identify.model import Segment, mean_voltage, prepare_segment
 from quadsim.features.identify.record import Record, part_of
 from quadsim.features.identify.rotor_response import RotorResponse, response_speeds, rotor_response
 from quadsim.features.identify.search import DRAG_AREAS, FLAT_BODY, Search
@@ -69,13 +69,13 @@ def identify_records(
     return with_disturbance(_result(judgement, refined), refined)
 
 
-def _flown(records: Sequence[Record], spans: Sequence[Sequence[slice]]) -> list[Stretch]:
-    """The stretches of all records that fly."""
+def _flown(records: Sequence[Record], spans: Sequence[Sequence[slice]]) -> list[Segment]:
+    """The segments of all records that fly."""
     flown = []
     for flight, (record, spans_of_record) in enumerate(zip(records, spans, strict=True)):
         for span in spans_of_record:
-            flown.append(stretch(part_of(record, span), flight))
-    if {part.flight for part in flown} != {*range(len(records))}:
+            flown.append(prepare_segment(part_of(record, span), flight))
+    if {segment.flight for segment in flown} != {*range(len(records))}:
         raise InputError("no part of the logs flies")
     logged = {(record.speeds is None, record.commands is None, record.voltage is None) for record in records}
     if len(logged) > 1:
@@ -84,14 +84,14 @@ def _flown(records: Sequence[Record], spans: Sequence[Sequence[slice]]) -> list[
     return flown
 
 
-def _with_instruments(flown: Sequence[Stretch], vehicle: Vehicle) -> tuple[dict[str, RotorResponse], list[Stretch]]:
-    """The rotors' response, and the stretches with the speeds that it and the commands predict."""
+def _with_instruments(flown: Sequence[Segment], vehicle: Vehicle) -> tuple[dict[str, RotorResponse], list[Segment]]:
+    """The rotors' response, and the segments with the speeds that it and the commands predict."""
     voltage = mean_voltage(flown)
     response = rotor_response(flown, vehicle, voltage)
     instrumented = []
-    for part in flown:
-        speeds = response_speeds(part, vehicle, voltage, response)
-        instrumented.append(replace(part, instrument_speeds=speeds))
+    for segment in flown:
+        speeds = response_speeds(segment, vehicle, voltage, response)
+        instrumented.append(replace(segment, instrument_speeds=speeds))
     return response, instrumented
 
 
@@ -99,7 +99,7 @@ def _negative_damping(search: Search) -> dict[str, float]:
     """Sought numbers that would drive a motion instead of slowing it, each with the 0 to hold it at."""
     parameters = search.parameters(search.x, 0)
     values = dict(zip(DAMPING, (*parameters.rate_damping, parameters.inflow), strict=True))
-    sought = {parameter.name for parameter in search.free}
+    sought = search.names
     return {name: 0.0 for name, value in values.items() if value < 0.0 and name in sought}
 
 
@@ -119,6 +119,7 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
     values, moved = judgement.moved_to(refined)
     estimates = {**judgement.estimates, **moved}.values()
     flights = tuple(_flight_numbers(refined, flight) for flight in range(refined.flight_count))
+    delays, offsets, winds = zip(*flights, strict=True)
 
     def of_response(name: str, sought: float) -> float:
         """What measured speeds show of the response to throttle and voltage, else what was searched for."""
@@ -130,9 +131,9 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
     return Identification(
         estimates=tuple(estimates),
         vehicle=_vehicle(judgement, values),
-        delay=np.mean([flight.delay for flight in flights], axis=0).tolist(),
-        offset=tuple(np.mean([flight.offset for flight in flights], axis=0).tolist()),
-        wind=tuple(np.mean([flight.wind for flight in flights], axis=0).tolist()),
+        delay=float(np.mean(delays)),
+        offset=tuple(np.mean(offsets, axis=0).tolist()),
+        wind=tuple(np.mean(winds, axis=0).tolist()),
         flights=flights,
         throttle_curve=of_response("throttle_curve", parameters.throttle_curve),
         voltage_exponent=of_response("voltage_exponent", parameters.voltage_exponent),
@@ -144,12 +145,15 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
 
 def _flight_numbers(refined: Search, flight: int) -> FlightNumbers:
     """The numbers of a flight's own, its wind in the mean."""
-    of_parts = []
-    for i, part in enumerate(refined.parts):
-        if part.flight == flight:
-            of_parts.append(refined.parameters(refined.x, i))
-    wind = np.mean([parameters.wind.mean(axis=0) for parameters in of_parts], axis=0)
-    return FlightNumbers(of_parts[0].delay, tuple(of_parts[0].offset.tolist()), tuple(wind.tolist()))
+    numbers = []
+    winds = []
+    for i, segment in enumerate(refined.segments):
+        if segment.flight == flight:
+            parameters = refined.parameters(refined.x, i)
+            numbers.append(parameters)
+            winds.append(parameters.wind.mean(axis=0))
+    wind = np.mean(winds, axis=0)
+    return FlightNumbers(numbers[0].delay, tuple(numbers[0].offset.tolist()), tuple(wind.tolist()))
 
 
 def _vehicle(judgement: JudgedFit, values: Mapping[str, float]) -> Vehicle:

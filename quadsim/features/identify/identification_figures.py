@@ -26,7 +26,7 @@ from quadsim.features.identify.prediction import (
 )
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
-from quadsim.state import shown_unit
+from quadsim.state import Array, shown_unit
 
 _COLOURS: Final = {
     IDENTIFIED: CYCLE[0],
@@ -65,50 +65,57 @@ _SIGNALS: Final = (
 def interval_figure(estimates: Sequence[ParameterEstimate]) -> Figure:
     """Return each parameter's interval and start in percent of its value; those that a gate refuses are grey."""
     drawn = [estimate for estimate in estimates if estimate.in_file]
+    names = tuple(estimate.name for estimate in drawn)
     places = np.arange(float(len(drawn)))
-    series = []
-    for refused, colour, label in (
-        (False, _COLOURS[IDENTIFIED], "95 % interval"),
-        (True, COLOUR.measured, "refused by a gate"),
-    ):
-        x = []
-        y = []
-        for place, estimate in enumerate(drawn):
-            if bool(estimate.refused) is refused:
-                x += [place, place, np.nan]
-                y += [_percent(estimate.low, estimate), _percent(estimate.high, estimate), np.nan]
-        if x:
-            series.append(Series(x=np.array(x), y=np.array(y), colour=colour, label=label, width=5.0))
-    values = Series(x=places, y=np.zeros(len(drawn)), colour=_COLOURS[IDENTIFIED], style="points", width=4.0)
-    starts = []
-    shown = [1.0]  # percent that the panel has to reach
-    for estimate in drawn:
-        start = np.nan
-        if estimate.start is not None:
-            start = _percent(estimate.start, estimate)
-        starts.append(start)
-        if not estimate.refused:
-            for end in (estimate.low, estimate.high, estimate.start or estimate.value):
-                shown.append(_percent(end, estimate))
-    start_series = Series(
-        x=places,
-        y=np.array(starts),
-        colour=_COLOURS[START],
-        label=START,
-        style="points",
-        marker="diamond",
-        width=6.0,
-    )
-    reach = 1.2 * min(max(np.abs(shown)), 100.0)
+    colour = _COLOURS[IDENTIFIED]
+    values = Series(x=places, y=np.zeros(len(drawn)), colour=colour, style="points", width=4.0)
     panel = Panel(
         title="relative to the estimate",
         unit="%",
-        series=(*series, values, start_series),
-        y_range=(-reach, reach),
-        x_names=tuple(estimate.name for estimate in drawn),
+        series=(
+            *_interval_series(drawn, colour, "95 % interval", refused=False),
+            *_interval_series(drawn, COLOUR.measured, "refused by a gate", refused=True),
+            values,
+            _start_series(drawn, places),
+        ),
+        y_range=_reach(drawn),
+        x_names=names,
         height=1.3,
     )
     return Figure(key="intervals", title="intervals", panels=(panel,), columns=1)
+
+
+def _interval_series(drawn: Sequence[ParameterEstimate], colour: str, label: str, *, refused: bool) -> list[Series]:
+    """A line from end to end of each interval of those that are refused, or of the others; none without any."""
+    x = []
+    y = []
+    for place, estimate in enumerate(drawn):
+        if bool(estimate.refused) is refused:
+            x += [place, place, np.nan]
+            y += [_percent(estimate.low, estimate), _percent(estimate.high, estimate), np.nan]
+    if not x:
+        return []
+    return [Series(x=np.array(x), y=np.array(y), colour=colour, label=label, width=5.0)]
+
+
+def _start_series(drawn: Sequence[ParameterEstimate], places: Array) -> Series:
+    """The start's numbers, where it has any."""
+    y = np.full(len(drawn), np.nan)
+    for place, estimate in enumerate(drawn):
+        if estimate.start is not None:
+            y[place] = _percent(estimate.start, estimate)
+    return Series(x=places, y=y, colour=_COLOURS[START], label=START, style="points", marker="diamond", width=6.0)
+
+
+def _reach(drawn: Sequence[ParameterEstimate]) -> tuple[float, float]:
+    """Percent either way within which the identified intervals and their starts are, 100 at most, and a margin."""
+    shown = [1.0]
+    for estimate in drawn:
+        if not estimate.refused:
+            for value in (estimate.low, estimate.high, estimate.start or estimate.value):
+                shown.append(_percent(value, estimate))
+    reach = 1.2 * min(max(np.abs(shown)), 100.0)
+    return -reach, reach
 
 
 def _percent(value: float, estimate: ParameterEstimate) -> float:

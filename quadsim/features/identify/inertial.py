@@ -56,7 +56,7 @@ def _likely(load: float) -> str:
     return "not the specific force in body axes"
 
 
-def filled_in(velocity: Array, inertial: Array, window: int) -> Array:
+def filled_velocity(velocity: Array, inertial: Array, window: int) -> Array:
     """Velocity (N, 3) that follows the one logged over a window of samples, and the inertial one within it."""
     difference = velocity - inertial
     there = np.asarray(np.isfinite(difference).all(axis=1))[:, None]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from quadsim.features.identify.model import INCREMENTS
-from quadsim.features.identify.search import NormalEquations, Search
+from quadsim.features.identify.search import NormalEquations, Search, joined
 from quadsim.state import Array
 
 INTERVAL_SHARE: Final = 0.95
@@ -33,7 +33,7 @@ class Intervals:
     def __init__(self, search: Search) -> None:
         blocks = search.blocks(instrumented=True)
         _, prior = search.prior(search.x)
-        whole = _joined(blocks, prior.H)
+        whole = _with_information(blocks, prior.H)
         self.covariance = _covariance(whole)
         self.prior_shares = np.diag(self.covariance) * np.diag(prior.H)  # of the information on each number of x
         self.autocorrelation = _autocorrelation(search)
@@ -41,9 +41,11 @@ class Intervals:
         self._quantile = student_quantile(len(blocks))
         shortest = min(map(len, search.innovations(search.x)))
         self._max_autocorrelation = max(MAX_AUTOCORRELATION, CHANCE_AUTOCORRELATION / shortest**0.5)
-        self._flights = []
-        for flight in range(search.flight_count):
-            of_flight = [b for b, f in zip(blocks, search.flight_of_blocks(), strict=True) if f == flight]
+        self._flights = []  # of each, how far it alone would move x, and the covariance of that
+        blocks_by_flight: list[list[NormalEquations]] = [[] for _ in range(search.flight_count)]
+        for block, flight in zip(blocks, search.flight_of_blocks(), strict=True):
+            blocks_by_flight[flight].append(block)
+        for of_flight in blocks_by_flight:
             self._flights.append(_flight_alone(of_flight, whole))
 
     def half_width(self, shares: Mapping[int, float], axes: Sequence[str], model_error: float) -> float:
@@ -100,12 +102,10 @@ def deviation_between(values: Array, variances: Array) -> float:
     return math.sqrt(between * float(weights @ weights)) / total
 
 
-def _joined(blocks: Sequence[NormalEquations], prior: Array) -> NormalEquations:
-    """All blocks and the priors' information as one."""
-    H = np.sum([block.H for block in blocks], axis=0)
-    g = np.sum([block.g for block in blocks], axis=0)
-    S = np.sum([block.S for block in blocks], axis=0)
-    return NormalEquations(H + prior, g, S + prior)
+def _with_information(blocks: Sequence[NormalEquations], information: Array) -> NormalEquations:
+    """All blocks as one, and information on x (X, X) besides."""
+    whole = joined(blocks)
+    return NormalEquations(whole.H + information, whole.g, whole.S + information)
 
 
 def _covariance(equations: NormalEquations) -> Array:
@@ -116,7 +116,7 @@ def _covariance(equations: NormalEquations) -> Array:
 
 def _flight_alone(blocks: Sequence[NormalEquations], whole: NormalEquations) -> tuple[Array, Array]:
     """How far a flight alone, by its blocks, would move x from what all flights gave together, and its covariance."""
-    alone = _joined(blocks, _SHARED_INFORMATION * whole.H)
+    alone = _with_information(blocks, _SHARED_INFORMATION * whole.H)
     alone = alone._replace(S=alone.S + _SHARED_INFORMATION * (whole.S - whole.H))
     return np.asarray(-np.linalg.solve(alone.H, alone.g)), _covariance(alone)
 
@@ -124,10 +124,10 @@ def _flight_alone(blocks: Sequence[NormalEquations], whole: NormalEquations) -> 
 def _autocorrelation(search: Search) -> dict[str, float]:
     """Largest |autocorrelation| of each axis's innovations at lags up to `_LONGEST_LAG`."""
     largest = np.zeros(len(INCREMENTS))
-    for part, innovations in zip(search.parts, search.innovations(search.x), strict=True):
+    for segment, innovations in zip(search.segments, search.innovations(search.x), strict=True):
         e = innovations - innovations.mean(axis=0)
         variance = (e**2).mean(axis=0)
-        lags = max(1, round(_LONGEST_LAG / part.step))
+        lags = max(1, round(_LONGEST_LAG / segment.step))
         for lag in range(1, 1 + lags):
             largest = np.maximum(largest, np.abs((e[lag:] * e[:-lag]).mean(axis=0)) / variance)
     return dict(zip(INCREMENTS, np.minimum(largest, 0.99).tolist(), strict=True))

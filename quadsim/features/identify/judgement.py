@@ -117,11 +117,11 @@ class JudgedFit:
         self.search = search
         self.vehicle = search.vehicle
         self.intervals = Intervals(search)
-        record = search.parts[0].record
+        record = search.segments[0].record
         self.speeds_measured = record.speeds is not None
         self._throttle_only = record.speeds is None and record.commands is None
         self._gusts_turn = self._wind_makes_torque()
-        self._rotors_unknown = max(part.record.rotors_unknown for part in search.parts)
+        self._rotors_unknown = max(segment.record.rotors_unknown for segment in search.segments)
         self.refitted: set[str] = set()
         """Numbers that are refused and yet sought once more: where the log speaks against the start."""
         self.estimates = self._all_estimates(response)
@@ -133,21 +133,23 @@ class JudgedFit:
 
     def held(self) -> dict[str, float]:
         """What the second search does not seek: numbers that a gate refuses, at what the file will say of them."""
-        held = {}
+        known = {*self.search.names, *self.search.fixed}
+        held = dict(self.search.fixed)
         for name, estimate in self.estimates.items():
             if not estimate.refused or name in self.refitted:
                 continue
-            if estimate.in_file:
-                held[name] = estimate.start or 0.0
-            elif name in ("delay", "lateness"):
-                held["delay"] = 0.0
-            elif name == "throttle_curve":
-                held[name] = self.vehicle.throttle_share
+            if name == "lateness":
+                parameter = "delay"
             else:
-                held[name] = 0.0
-        sought = {parameter.name for parameter in self.search.free}
-        known = {name: value for name, value in held.items() if name in sought or name in self.search.fixed}
-        return {**self.search.fixed, **known}
+                parameter = name
+            value = 0.0
+            if estimate.in_file:
+                value = estimate.start or 0.0
+            elif name == "throttle_curve":
+                value = self.vehicle.throttle_share
+            if parameter in known:
+                held[parameter] = value
+        return held
 
     def refuse_moved(self, refined: Search) -> dict[str, float]:
         """Judge the intervals that another search widened; return what is to be held since, as `held` does."""
@@ -236,11 +238,10 @@ class JudgedFit:
 
     def _wind_makes_torque(self) -> bool:
         """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
-        free = self.search.free
-        if not any(parameter.name == "wind" for parameter in free):
+        if "wind" not in self.search.names:
             return False
         deviations = np.sqrt(np.diag(self.intervals.covariance))
-        for place, parameter in enumerate(free):
+        for place, parameter in enumerate(self.search.free):
             if parameter.name.startswith("rotor_moment"):
                 moment = parameter.value(self.search.x[place])
                 if abs(moment) > 2.0 * deviations[place] * (parameter.scale or 0.0):
@@ -248,17 +249,17 @@ class JudgedFit:
         return False
 
     def _all_estimates(self, response: Mapping[str, RotorResponse]) -> dict[str, ParameterEstimate]:
-        found = {}
+        estimates = {}
         for name, places in self._places().items():
-            found[name] = self._estimate(name, places)
+            estimates[name] = self._estimate(name, places)
         for name, number in response.items():
-            found[name] = self._response_estimate(name, number)
-        if "rotor_rise" not in found:
+            estimates[name] = self._response_estimate(name, number)
+        if "rotor_rise" not in estimates:
             fault = "the log has the rotors' speeds but not their commands"
             lag = self.vehicle.rotor_rise or 0.0
             for name in ("rotor_rise", "rotor_fall"):
-                found[name] = self._judged(name, lag, (lag, lag), fault)
-        return self._judged_together(found)
+                estimates[name] = self._judged(name, lag, (lag, lag), fault)
+        return self._judged_together(estimates)
 
     def _estimate(self, name: str, places: Sequence[int]) -> ParameterEstimate:
         """One number, or the mean of those of each flight with an interval that holds each."""
@@ -276,8 +277,7 @@ class JudgedFit:
         estimate = self._judged(name, value, ends, self._fault(name, places, half, value))
         if not WIDEST < half < _REPEATABLE * WIDEST or not estimate.refused.startswith(_NOT_EXCITED):
             return estimate
-        flown = sum(part.seconds for part in self.search.parts)
-        needed = flown * (half / WIDEST) ** 2
+        needed = self.search.seconds * (half / WIDEST) ** 2
         return replace(estimate, advice=f"{estimate.advice}, or the same again, {needed:.0f} s in all")
 
     def _speaks_against_the_start(self, place: int) -> bool:
@@ -312,14 +312,14 @@ class JudgedFit:
         return ""
 
     def _uncarried(self) -> float:
-        """Share of the weight that neither thrust nor drag carry, in the mean over all stretches."""
+        """Share of the weight that neither thrust nor drag carry, in the mean over all segments."""
         search = self.search
         lift_misfits = []
-        for i in range(len(search.parts)):
+        for i in range(len(search.segments)):
             misfit, _ = search.misfit(search.x, i)
             lift_misfits.append(misfit[:, -1])
         mean = float(np.concatenate(lift_misfits).mean())
-        return mean / (self.vehicle.gravity * search.parts[0].step)
+        return mean / (self.vehicle.gravity * search.segments[0].step)
 
     def _response_estimate(self, name: str, number: RotorResponse) -> ParameterEstimate:
         """A number of how the rotors respond, where the log has both speeds and commands."""
@@ -350,38 +350,38 @@ class JudgedFit:
             in_file=in_file,
         )
 
-    def _judged_together(self, found: dict[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+    def _judged_together(self, estimates: dict[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
         """Refuse what cannot be told without a number that is refused."""
 
         def refuse(name: str, fault: str, advice: str) -> None:
-            found[name] = replace(found[name], refused=fault, advice=advice)
+            estimates[name] = replace(estimates[name], refused=fault, advice=advice)
 
-        lags = [name for name in ("rotor_rise", "rotor_fall") if found[name].refused]
+        lags = [name for name in ("rotor_rise", "rotor_fall") if estimates[name].refused]
         if lags and not self.speeds_measured:
             unknown = " and ".join(lags)
             fault = f"{unknown} tell nothing, and no lag can be told from inertia without the rotors' speeds"
             for name in ("inertia_x", "inertia_y", "inertia_z"):
-                if not found[name].refused:
+                if not estimates[name].refused:
                     refuse(name, fault, _LOG_SPEEDS)
         if self._throttle_only:
             highest = f"{self.vehicle.speed_max:g} rad/s"
             fault = f"a log of the throttle shows it only for the highest speed of {highest}, kept"
             for name in _SCALED_BY_SPEED:
-                if name in found:  # it is not where it was held, as below 0
+                if name in estimates:  # it is not where it was held, as below 0
                     refuse(name, fault, _LOG_SPEEDS)
             self.refitted |= {*_SCALED_BY_SPEED}
         inertia = []
         for name in ("inertia_x", "inertia_y", "inertia_z"):
-            estimate = found[name]
+            estimate = estimates[name]
             inertia.append(estimate.start if estimate.refused and estimate.start else estimate.value)
-        if not found["inertia_z"].refused and not is_body(inertia):
+        if not estimates["inertia_z"].refused and not is_body(inertia):
             fault = f"no body has it beside {inertia[0]:.4g} and {inertia[1]:.4g} about x and y"
             refuse("inertia_z", fault, _TURNS)
-        if found["inertia_z"].refused and self._knows_yaw_acceleration():
+        if estimates["inertia_z"].refused and self._knows_yaw_acceleration():
             fault = "only the yaw acceleration that it gives is identified, with inertia_z as kept"
             refuse("drag_to_thrust", fault, _TURNS)
             self.refitted.add("drag_to_thrust")
-        return _in_order(found)
+        return _in_order(estimates)
 
     def _knows_yaw_acceleration(self) -> bool:
         """Whether d b / J_z, drag to thrust times thrust over inertia, is known where none of them may be."""

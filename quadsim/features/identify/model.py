@@ -1,6 +1,6 @@
 """Increments of velocity and body rates from sample to sample, as measured and as a vehicle's parameters predict.
 
-A stretch of a log is prepared once: what was measured over each period, and the mean motion in it.  The equations of
+A segment of a log is prepared once: what was measured over each period, and the mean motion in it.  The equations of
 `predicted_increments` give the same from the rotors' speeds; the search makes their difference, the misfit, small.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from quadsim.features.identify.record import Record, new_rows, part_of
-from quadsim.features.identify.rotors import Turning, lagging, measured, smoothed
+from quadsim.features.identify.rotors import RotorMotion, lagged_rotors, measured_rotors, smoothed_speeds
 from quadsim.features.identify.series import interpolated
 from quadsim.rotation import exponential, multiply, normalise
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
@@ -84,7 +84,7 @@ class MeanMotion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stretch:
+class Segment:
     """Part of a record that flies, with what no parameter changes: the measured increments and the mean motion."""
 
     record: Record
@@ -111,32 +111,32 @@ class Stretch:
         return self.increments - predicted
 
 
-def voltages(parts: Sequence[Stretch]) -> Array:
-    """The battery's voltage in all samples of some stretches [V]; none where it is not logged."""
-    logged = [part.record.voltage for part in parts if part.record.voltage is not None]
+def voltages(segments: Sequence[Segment]) -> Array:
+    """The battery's voltage in all samples of some segments [V]; none where it is not logged."""
+    logged = [segment.record.voltage for segment in segments if segment.record.voltage is not None]
     return np.concatenate([np.zeros(0), *logged])
 
 
-def mean_voltage(parts: Sequence[Stretch]) -> float:
-    """Return the mean voltage of the battery in some stretches, 0 where none is logged [V]."""
-    samples = voltages(parts)
+def mean_voltage(segments: Sequence[Segment]) -> float:
+    """Return the mean voltage of the battery in some segments, 0 where none is logged [V]."""
+    samples = voltages(segments)
     if not samples.size:
         return 0.0
     return float(np.mean(samples))
 
 
-def stretch(record: Record, flight: int) -> Stretch:
+def prepare_segment(record: Record, flight: int) -> Segment:
     """Prepare a record, all of which flies, from its first new row to its last."""
     new = new_rows(record)
     record = part_of(record, slice(new[0], new[-1] + 1))
     rows = new - new[0]
     if record.speeds is not None:
-        record = replace(record, speeds=smoothed(record.speeds))
+        record = replace(record, speeds=smoothed_speeds(record.speeds))
     turn = Rotation.from_quat(_filtered_attitude(record), scalar_first=True).as_matrix()
     motion = MeanMotion(period=record.period, rates=_mid(record.rates), turn=_mid(turn), velocity=_mid(record.velocity))
     rates_and_velocity = np.concatenate([record.rates, record.velocity], axis=1)
     increments = np.diff(rates_and_velocity[rows], axis=0)
-    return Stretch(record=record, flight=flight, increments=increments, starts=rows[:-1], motion=motion)
+    return Segment(record=record, flight=flight, increments=increments, starts=rows[:-1], motion=motion)
 
 
 def _mid(rows: Array) -> Array:
@@ -159,15 +159,15 @@ def _filtered_attitude(record: Record) -> Array:
     return np.array(filtered)
 
 
-def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
+def rotor_motion(record: Record, vehicle: Vehicle, p: Parameters) -> RotorMotion:
     """The rotors' speeds, from whatever the record has of them."""
     if record.speeds is not None:
-        return measured(record.speeds, record.period, delay=p.delay)
-    commands = commanded(record, vehicle, p)
-    return lagging(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
+        return measured_rotors(record.speeds, record.period, delay=p.delay)
+    commands = demanded_speeds(record, vehicle, p)
+    return lagged_rotors(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
 
 
-def commanded(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
+def demanded_speeds(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
     """(N, 4) rotor speeds that the commands or the throttle demand [rad/s]."""
     if record.commands is not None:
         commands = record.commands
@@ -189,7 +189,7 @@ class _RotorForces(NamedTuple):
     thrust: Array  # (M, 4)
 
 
-def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
+def predicted_increments(motion: MeanMotion, rotors: RotorMotion, vehicle: Vehicle, p: Parameters) -> Array:
     """(M, 6) increments of body rates and velocity in each period, as the parameters predict them.
 
     J dw/dt = sum r_i x f_i + tau_air - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = (b w_i^2 -
@@ -219,7 +219,7 @@ def _air_velocity(motion: MeanMotion, p: Parameters) -> Array:
     return np.asarray(np.einsum("kji,kj->ki", motion.turn, motion.velocity - wind))
 
 
-def _rotor_forces(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters, air: Array) -> _RotorForces:
+def _rotor_forces(motion: MeanMotion, rotors: RotorMotion, vehicle: Vehicle, p: Parameters, air: Array) -> _RotorForces:
     """Thrust less what inflow takes, and drag, by the velocity of each hub through the air."""
     x, y, _ = vehicle.hubs.T
     roll, pitch, yaw = motion.rates.T
@@ -233,7 +233,7 @@ def _rotor_forces(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Para
 
 
 def _torque(
-    motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters, air: Array, forces: _RotorForces
+    motion: MeanMotion, rotors: RotorMotion, vehicle: Vehicle, p: Parameters, air: Array, forces: _RotorForces
 ) -> Array:
     """(M, 3) torque about the body axes [N m], the gyroscopic one included, without damping and the rotors' spin-up."""
     x, y, _ = vehicle.hubs.T

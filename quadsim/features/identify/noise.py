@@ -31,7 +31,7 @@ _SLOPE_STEP: Final = 1e-3  # for slopes of innovations by differences, in logari
 _FARTHEST: Final = 50.0  # largest logarithm of a deviation that the search tries, either way
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
 _REGULAR: Final = 1e-6 * np.eye(3)  # information without which a number that nothing shows has none
-_MEMORY: Final = 2000  # samples after which a stretch has forgotten the error of its first
+_MEMORY: Final = 2000  # samples after which a segment has forgotten the error of its first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,30 +110,22 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
     """Return the likeliest noise of an axis.
 
     Args:
-        misfits: (N,) of each stretch of the logs.
-        periods: between samples [s], of each stretch.
-        blocks: of each stretch, the samples of the parts that are left out in turn.
+        misfits: (N,) of each segment of the logs.
+        periods: between samples [s], of each segment.
+        blocks: of each segment, the samples of the parts that are left out in turn.
     """
-    spread = max(float(np.concatenate(misfits).std()), _LEAST_SPREAD)
     least = np.array([-_FARTHEST, math.log(SHORTEST_NOISE * periods[0]), -_FARTHEST])
     most = np.array([_FARTHEST, math.log(LONGEST_NOISE), _FARTHEST])
-    samples = sum(map(len, misfits))
-    share = min(1.0, _FIRST_SAMPLES / samples)
-    first_misfits = [misfit[: math.ceil(share * len(misfit))] for misfit in misfits]
 
     def noise_of(x: Array) -> AxisNoise:
         deviation, time, sensor = np.exp(np.clip(x, least, most)).tolist()
         return AxisNoise(deviation=deviation, time=time, sensor=sensor)
 
-    def cost(x: Array) -> float:
+    def cost(x: Array, misfits: Sequence[Array]) -> float:
         beyond = float(np.abs(x - np.clip(x, least, most)).sum())
-        return beyond + _cost(noise_of(x), first_misfits, periods)
+        return beyond + _cost(noise_of(x), misfits, periods)
 
-    searches = []
-    for time in _FIRST_TIMES:
-        begin = np.log([0.3 * spread / periods[0], time, 0.5 * spread])
-        searches.append(minimize(cost, begin, method="Nelder-Mead", options=_SIMPLEX))
-    x = min(searches, key=lambda search: float(search.fun)).x
+    x = _rough_minimum(cost, misfits, periods)
     reached = _cost(noise_of(x), misfits, periods)
     for _ in range(_MAX_SCORING_STEPS):
         information, gradients = _information(x, noise_of, misfits, periods, blocks)
@@ -152,6 +144,20 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
         left_out=np.array(left_out)[:, :2],
         gain=_cost_of_sensor_alone(misfits) - reached,
     )
+
+
+def _rough_minimum(
+    cost: Callable[[Array, Sequence[Array]], float], misfits: Sequence[Array], periods: Sequence[float]
+) -> Array:
+    """Logarithms of deviation, time constant and sensor's deviation at the least cost of the first samples."""
+    spread = max(float(np.concatenate(misfits).std()), _LEAST_SPREAD)
+    share = min(1.0, _FIRST_SAMPLES / sum(map(len, misfits)))
+    first = [misfit[: math.ceil(share * len(misfit))] for misfit in misfits]
+    searches = []
+    for time in _FIRST_TIMES:
+        begin = np.log([0.3 * spread / periods[0], time, 0.5 * spread])
+        searches.append(minimize(cost, begin, args=(first,), method="Nelder-Mead", options=_SIMPLEX))
+    return np.asarray(min(searches, key=lambda search: float(search.fun)).x)
 
 
 def _cost(noise: AxisNoise, misfits: Sequence[Array], periods: Sequence[float]) -> float:

@@ -19,10 +19,17 @@ from scipy.spatial.transform import Rotation
 from quadsim.errors import InputError
 from quadsim.features.identify.checks import SHORTEST_SPAN
 from quadsim.features.identify.estimate import Identification
-from quadsim.features.identify.model import INCREMENTS, MeanMotion, Parameters, predicted_increments, stretch, turning
+from quadsim.features.identify.model import (
+    INCREMENTS,
+    MeanMotion,
+    Parameters,
+    predicted_increments,
+    prepare_segment,
+    rotor_motion,
+)
 from quadsim.features.identify.noise import AxisNoise
 from quadsim.features.identify.record import ROTOR_INPUTS, Record, new_rows, part_of
-from quadsim.features.identify.rotors import Turning
+from quadsim.features.identify.rotors import RotorMotion
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
 
@@ -208,10 +215,11 @@ def predict(
     residuals = {}
     for model in spans_predicted[0].residuals:
         residuals[model] = np.concatenate([span.residuals[model] for span in spans_predicted])
+    longest = max(spans_predicted, key=lambda span: len(span.trace.t))
     return PredictionErrors(
         windows=len(errors[IDENTIFIED]),
         errors={model: of_windows.mean(axis=0) for model, of_windows in errors.items()},
-        trace=max((span.trace for span in spans_predicted), key=lambda trace: len(trace.t)),
+        trace=longest.trace,
         ends=_one_after_the_other([span.t for span in spans_predicted]),
         residuals=residuals,
     )
@@ -272,10 +280,10 @@ def _predictions(
     held = _with_inputs_held(record)
     windows = _Windows(rows=rows, measured=measured, period=record.period, vehicle=start)
     identified = parameters_of(known)
-    rotors = turning(held, start, identified)
+    rotors = rotor_motion(held, start, identified)
     disturbance = _forecast(known.noise, identified, start, held, rotors, rows)
     of_start = Parameters.of(start, voltage=known.voltage or 0.0)
-    rotors_of_start = turning(held, start, of_start)
+    rotors_of_start = rotor_motion(held, start, of_start)
     disturbance_of_start = _forecast(known.noise, of_start, start, held, rotors_of_start, rows)
     states = {
         IDENTIFIED: windows.simulated(identified, rotors, disturbance),
@@ -309,7 +317,7 @@ def parameters_of(known: Identification) -> Parameters:
 
 
 def _forecast(
-    noises: Sequence[AxisNoise], p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, rows: Indices
+    noises: Sequence[AxisNoise], p: Parameters, vehicle: Vehicle, held: Record, rotors: RotorMotion, rows: Indices
 ) -> Array:
     """(W, K - 1, 6) increments that the unknown torque and force are expected to give, by what precedes each window."""
     if not noises:
@@ -323,14 +331,14 @@ def _forecast(
     return np.stack(forecasts, axis=-1)
 
 
-def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, samples: slice) -> Array:
+def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: RotorMotion, samples: slice) -> Array:
     """(N - 1, 6) measured less predicted increments of N samples; those over held rows are spread evenly."""
     past = part_of(replace(held, speeds=None), samples)
     new = new_rows(past)
     first = int(new[0])
     last = int(new[-1])
     before = rotors.during(np.arange(samples.start + first, samples.start + last))
-    measured = stretch(past, 0)
+    measured = prepare_segment(past, 0)
     per_row = np.nan_to_num(measured.misfit(predicted_increments(measured.motion, before, vehicle, p)))
     periods = np.diff(new)
     misfit = np.zeros((samples.stop - samples.start - 1, len(INCREMENTS)))
@@ -388,7 +396,7 @@ class _Windows:
         return replace(self, rows=np.tile(self.rows, (times, 1)), measured=np.tile(self.measured, (times, 1, 1)))
 
     def simulated(
-        self, p: Parameters, rotors: Turning, disturbance: Array | None = None, *, decay_time: float | None = None
+        self, p: Parameters, rotors: RotorMotion, disturbance: Array | None = None, *, decay_time: float | None = None
     ) -> Array:
         """(W, K, 13) states, by the midpoint rule.
 
@@ -437,4 +445,6 @@ def _with_inputs_held(record: Record) -> Record:
     there = np.isfinite(np.column_stack([*inputs.values()])).all(axis=1)
     rows = np.where(there, np.arange(len(record.t)), int(there.argmax()))
     latest = np.maximum.accumulate(rows)
-    return replace(record, **{name: rows[latest] for name, rows in inputs.items()})
+    for name in inputs:
+        inputs[name] = inputs[name][latest]
+    return replace(record, **inputs)

@@ -1,19 +1,12 @@
 """Which columns of a log are which quantity, in which unit, sign and frame: by a format's own names, or by a map.
 
-`to_series` gives sign * (logged - zero) * scale, in our units and frames, which `record` samples on one clock.  A map
-is a TOML file with a table for each quantity that it names:
-
-    [rates]
-    columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
-    unit = "deg/s"
-    sign = [1, -1, -1]
-    frame = "FLU"
+`to_series` gives sign * (logged - zero) * scale, in our units and frames, which `record` samples on one clock.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -32,7 +25,7 @@ NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
 _MOST_LISTED: Final = 40  # names in a message
 _DEGREE: Final = math.pi / 180.0
-_STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
+STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 # Zero and scale of units: (logged - zero) * scale in ours.
 _LENGTHS: Final = {"m": (0.0, 1.0), "cm": (0.0, 0.01), "mm": (0.0, 1e-3)}
 _VELOCITIES: Final = {"m/s": (0.0, 1.0), "cm/s": (0.0, 0.01), "mm/s": (0.0, 1e-3), "km/h": (0.0, 1 / 3.6)}
@@ -58,7 +51,7 @@ LOGGED: Final = {
     "velocity": Quantity(3, _VELOCITIES, _WORLDS),
     "specific_force": Quantity(
         3,
-        {"m/s^2": (0.0, 1.0), "g": (0.0, _STANDARD_GRAVITY), "g/2048": (0.0, _STANDARD_GRAVITY / 2048)},
+        {"m/s^2": (0.0, 1.0), "g": (0.0, STANDARD_GRAVITY), "g/2048": (0.0, STANDARD_GRAVITY / 2048)},
         _BODIES,
     ),
     "attitude": Quantity(4, {"-": (0.0, 1.0)}, _WORLDS_AND_BODIES),
@@ -134,7 +127,13 @@ def usual_names(quantity: str, *ways: str, unit: str = "") -> tuple[NamedQuantit
 
 
 def read_map(path: Path) -> tuple[NamedQuantity, ...]:
-    """Read a map of columns.
+    """Read a map of columns: a TOML file with a table for each quantity that it names.
+
+        [rates]
+        columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
+        unit = "deg/s"
+        sign = [1, -1, -1]
+        frame = "FLU"
 
     Raises:
         FileError: it is not TOML, or a table of it is not as it should be; the message names the field.
@@ -155,50 +154,55 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
     unknown = sorted({*table} - {*defaults})
     if unknown:
         raise FileError(path, f"{quantity} has no {unknown[0]!r}; its fields are {fields}")
-    given = defaults | table
-
-    def require(field: str, right: bool, rule: str) -> None:
-        if not right:
-            raise FileError(path, f"{quantity}.{field} must be {rule}; got {given[field]!r:.80}")
-
-    names = given["columns"]
-    are_names = isinstance(names, list) and len(names) == size and all(isinstance(name, str) for name in names)
-    require("columns", are_names, f"a list of {size} name{'s' * (size > 1)}")
-    require("unit", given["unit"] in [*units], f"one of {', '.join(map(repr, units))}")
-    signs = given["sign"]
-    are_signs = isinstance(signs, list) and len(signs) == size and all(sign in (1, -1) for sign in signs)
-    require("sign", are_signs, f"a list of {size} of 1 and -1")
-    down = False
-    if frames:
-        require("frame", given["frame"] in frames, f"one of {', '.join(map(repr, frames))}")
-        down = given["frame"] == frames[1]
-    zero, scale = units[given["unit"]]
+    entry = defaults | table
+    for field, rule in _broken_rules(LOGGED[quantity], entry):
+        raise FileError(path, f"{quantity}.{field} must be {rule}; got {entry[field]!r:.80}")
+    zero, scale = units[entry["unit"]]
     return NamedQuantity(
         quantity=quantity,
-        columns=tuple(names),
+        columns=tuple(entry["columns"]),
         zero=zero,
         scale=scale,
-        sign=tuple(map(float, signs)),
-        down=down,
+        sign=tuple(map(float, entry["sign"])),
+        down=frames is not None and entry["frame"] == frames[1],
     )
 
 
+def _broken_rules(quantity: Quantity, entry: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The fields of a map's table that are not as they should be, and what they should be."""
+    size, units, frames = quantity
+    names = entry["columns"]
+    if not _has_size(names, size) or not all(isinstance(name, str) for name in names):
+        yield "columns", f"a list of {size} name{'s' * (size > 1)}"
+    if entry["unit"] not in [*units]:
+        yield "unit", f"one of {', '.join(map(repr, units))}"
+    signs = entry["sign"]
+    if not _has_size(signs, size) or not all(sign in (1, -1) for sign in signs):
+        yield "sign", f"a list of {size} of 1 and -1"
+    if frames and entry["frame"] not in frames:
+        yield "frame", f"one of {', '.join(map(repr, frames))}"
+
+
+def _has_size(values: Any, size: int) -> bool:
+    return isinstance(values, list) and len(values) == size
+
+
 def to_series(
-    path: Path, log: LoggedColumns, given: Sequence[NamedQuantity] = (), poles: int | None = None
+    path: Path, log: LoggedColumns, column_map: Sequence[NamedQuantity] = (), poles: int | None = None
 ) -> dict[str, Column]:
     """Return the series of a log by field of `quadsim.features.identify.record.Record`, in our units and frames.
 
     Args:
         path: of the log, for messages.
         log: what it has.
-        given: the map of its user, which comes before its own names.
+        column_map: the map of its user, which comes before its own names.
         poles: magnets of each motor, where the log has electrical speeds.
 
     Raises:
         FileError: a column is missing; the message names what is allowed.
         InputError: a sample or a unit cannot be meant, or poles are missing.
     """
-    named = _named_quantities(path, log, given)
+    named = _named_quantities(path, log, column_map)
     for quantity in named.values():
         _check_samples(path.name, log.columns, quantity)
     series = {}
@@ -223,15 +227,15 @@ def to_series(
     return series
 
 
-def _named_quantities(path: Path, log: LoggedColumns, given: Sequence[NamedQuantity]) -> dict[str, NamedQuantity]:
+def _named_quantities(path: Path, log: LoggedColumns, column_map: Sequence[NamedQuantity]) -> dict[str, NamedQuantity]:
     """The quantities of which a log has the columns, by the map first; refuse a log that lacks one that is needed."""
-    for quantity in given:
+    for quantity in column_map:
         missing = [column for column in quantity.columns if column not in log.columns]
         if missing:
             what = f"{quantity.quantity}.columns names {', '.join(map(repr, missing))}"
             raise FileError(path, f"lacks what the map's {what}; it has {listed(log.columns)}")
     named: dict[str, NamedQuantity] = {}
-    for quantity in (*given, *log.quantities):
+    for quantity in (*column_map, *log.quantities):
         if {*quantity.columns} <= {*log.columns}:
             named.setdefault(quantity.quantity, quantity)
     for what, alternatives in _NEEDED.items():

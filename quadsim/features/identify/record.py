@@ -18,9 +18,9 @@ from quadsim.errors import FileError, InputError
 from quadsim.features.identify import crazyflie, ulog
 from quadsim.features.identify.bags import read_bag
 from quadsim.features.identify.blackbox import read_blackbox
-from quadsim.features.identify.border import reading
 from quadsim.features.identify.dataflash import read_dataflash
-from quadsim.features.identify.inertial import filled_in, integrated_velocity, levelled_attitude
+from quadsim.features.identify.inertial import filled_velocity, integrated_velocity, levelled_attitude
+from quadsim.features.identify.log_errors import reading_errors
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from quadsim.features.identify.sensors import (
     NORM_TOLERANCE,
@@ -28,7 +28,7 @@ from quadsim.features.identify.sensors import (
     without_spikes,
     without_stopped_counters,
 )
-from quadsim.features.identify.series import Column, held, interpolated
+from quadsim.features.identify.series import Column, interpolated, latest_samples
 from quadsim.features.identify.tables import read_columns
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array, Indices
@@ -75,7 +75,7 @@ FORMATS: Final = (
 class Record:
     """A flight as it was logged: N samples, uniform in time; world z up, body x forward, y left, z up.
 
-    Samples in gaps of the log are NaN; `quadsim.features.identify.checks.spans` leaves them out.
+    Samples in gaps of the log are NaN; `quadsim.features.identify.checks.airborne_spans` leaves them out.
     """
 
     name: str  # of the log, for messages and sources
@@ -118,6 +118,11 @@ def new_rows(record: Record) -> Indices:
     return np.flatnonzero(record.fresh)
 
 
+def in_parts(rows: Array, parts: Sequence[slice]) -> Array:
+    """The rows in some parts of a record, one after the other."""
+    return np.concatenate([rows[part] for part in parts])
+
+
 def rotor_inputs(record: Record) -> Array:
     """What drives the rotors (N, 4): measured speeds, else the commands or the throttle."""
     if record.speeds is not None:
@@ -141,21 +146,21 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         MissingPackageError: its format needs a library that is not installed.
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
-    given = Path(path)
-    is_bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
-    if given.is_dir() and not is_bag:
-        file = given / FLIGHT_FILE
+    location = Path(path)
+    is_bag = (location / "metadata.yaml").is_file()  # of ROS 2, a directory
+    if location.is_dir() and not is_bag:
+        file = location / FLIGHT_FILE
     else:
-        file = given
+        file = location
     if not (file.is_file() or is_bag):
-        raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
+        raise FileError(location, "has no flight.parquet" if location.is_dir() else "is missing, or not a file")
     kind = _format_of(file)
     if kind.read is not read_columns and any(named.quantity == "t" for named in columns):
-        raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
+        raise InputError(f"{location.name}: has a clock of its own; leave [t] out of the map")
     name = file.name
     if name == FLIGHT_FILE:
         name = file.resolve().parent.name
-    with reading(file, kind.title, kind.library):
+    with reading_errors(file, kind.title, kind.library):
         log = kind.read(file, columns)
         series = to_series(file, log, columns, poles)
         record = to_record(name, series)
@@ -178,8 +183,11 @@ def _format_of(file: Path) -> LogFormat:
     for kind in FORMATS:
         if file.suffix.lower() in kind.suffixes:
             return kind
-    suffixes = ", ".join(suffix for kind in FORMATS for suffix in kind.suffixes)
-    raise FileError(file, f"is not a log that can be read (these can: {suffixes}, and those of a Crazyflie)")
+    suffixes: list[str] = []
+    for kind in FORMATS:
+        suffixes += kind.suffixes
+    listed = ", ".join(suffixes)
+    raise FileError(file, f"is not a log that can be read (these can: {listed}, and those of a Crazyflie)")
 
 
 def to_record(name: str, series: Mapping[str, Column]) -> Record:
@@ -188,8 +196,9 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
     has no gaps: it changes slowly; nor has `flying`, which changes rarely.
     """
-    flying = series.get("flying")
-    kept, notes = _without_failed_samples(name, {f: column for f, column in series.items() if f != "flying"})
+    logged = dict(series)
+    flying = logged.pop("flying", None)
+    kept, notes = _without_failed_samples(name, logged)
     voltage = kept.pop("voltage", None)
     fresh = kept.pop("fresh", None)
     force = kept.pop("specific_force", None)
@@ -203,23 +212,20 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     for field, column in moving.items():
         values[field] = _sampled(column, grid, held=field in HELD_INPUTS)
     _normalise_rows(values["attitude"])
+    velocity_period = _usual_period(moving["velocity"].t)
     if inertial:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
-    elif force is not None:
-        velocity_period = _usual_period(moving["velocity"].t)
-        if velocity_period > SLOWEST_VELOCITY:
-            inertial_velocity = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
-            window = round(2.0 * velocity_period / period)
-            values["velocity"] = filled_in(values["velocity"], inertial_velocity, window)
-            notes.append(
-                f"{name}: the velocity is logged at {1.0 / velocity_period:.3g} Hz; the accelerometer fills it in"
-            )
+    elif force is not None and velocity_period > SLOWEST_VELOCITY:
+        by_force = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
+        values["velocity"] = filled_velocity(values["velocity"], by_force, round(2.0 * velocity_period / period))
+        rate = 1.0 / velocity_period
+        notes.append(f"{name}: the velocity is logged at {rate:.3g} Hz; the accelerometer fills it in")
     if voltage is not None:
         there = np.isfinite(voltage.values[:, 0])
         if there.any():
             values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     if fresh is not None:
-        fresh_rows, known_rotors = held(fresh, grid + STAMP_JITTER * period).T
+        fresh_rows, known_rotors = latest_samples(fresh, grid + STAMP_JITTER * period).T
         values["fresh"] = fresh_rows
         values["rotors_unknown"] = np.full(len(grid), 1.0 - known_rotors.mean())
     size = int(1.0 / (FASTEST_RATE * period))
@@ -232,7 +238,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         values["fresh"] = values["fresh"] > 0.0
         values["rotors_unknown"] = float(values["rotors_unknown"][0])
     if flying is not None:
-        values["flying"] = held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+        values["flying"] = latest_samples(Column(flying.t, flying.values[:, 0]), grid) > 0.5
     return Record(name=name, t=grid, notes=tuple(notes), inertial=inertial, **values)
 
 

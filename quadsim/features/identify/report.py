@@ -17,8 +17,7 @@ import numpy as np
 
 from quadsim.console.results import Shown, Tabular, after
 from quadsim.errors import InputError, MissingPackageError, ParameterError
-from quadsim.features.identify.border import judging
-from quadsim.features.identify.checks import check_log, spans
+from quadsim.features.identify.checks import airborne_spans, check_log
 from quadsim.features.identify.estimate import DisturbanceEstimate, Identification, ParameterEstimate
 from quadsim.features.identify.fit import identify_records
 from quadsim.features.identify.identification_figures import (
@@ -27,6 +26,7 @@ from quadsim.features.identify.identification_figures import (
     residual_figure,
     trace_figure,
 )
+from quadsim.features.identify.log_errors import fitting_errors
 from quadsim.features.identify.prediction import (
     HORIZONS,
     JUDGED,
@@ -270,38 +270,23 @@ def identify_logs(
     file = None if out is None else require_file(out, overwrite=overwrite)
     page = None if page is None else require_file(page, overwrite=overwrite)
     vehicle = load_vehicle(start)
-    usable, notes = _usable(logs, vehicle, poles, columns)
-    usable_tests, test_notes = _usable(test, vehicle, poles, columns)
-    both = [*usable, *usable_tests]
-    _refuse_same_flights([log.record for log in both])
-    records = [log.record for log in usable]
-    tested = [log.record for log in usable_tests]
-    fitted = [log.spans for log in usable]
-    held_out = [log.spans for log in usable_tests]
-    names = tuple(record.name for record in records)
-    with judging(", ".join(names)):
-        if not tested:
-            cuts = [hold_out(record, spans) for record, spans in zip(records, fitted, strict=True)]
-            fitted = [fitted_spans for fitted_spans, _ in cuts]
-            held_out = [held_spans for _, held_spans in cuts]
-        try:
-            identification = identify_records(records, fitted, vehicle, wind=wind)
-        except ParameterError as error:
-            if error.owner != "vehicle":
-                raise
-            raise InputError(
-                f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
-                "range, or what was kept and does not suit what was identified"
-            ) from None
-        prediction = predict(tested or records, held_out, identification, vehicle, fitted=not tested)
+    fitted, notes = _usable(logs, vehicle, poles, columns)
+    tested, test_notes = _usable(test, vehicle, poles, columns)
+    notes += test_notes
+    for log in (*fitted, *tested):
+        notes += log.notes
+    _refuse_same_flights([*fitted, *tested])
+    names = tuple(log.record.name for log in fitted)
+    with fitting_errors(", ".join(names)):
+        identification, prediction = _fit_and_predict(fitted, tested, start, vehicle, wind=wind)
     if prediction.lost and not anyway:
         file = None
     result = IdentifiedVehicle(
         identification=identification,
         prediction=prediction,
-        notes=(*notes, *test_notes, *(note for log in both for note in log.notes)),
+        notes=tuple(notes),
         logs=names,
-        test=tuple(record.name for record in tested),
+        test=tuple(log.record.name for log in tested),
         content=vehicle_text(identification, start, names),
         file=file,
         page=page,
@@ -316,10 +301,39 @@ def identify_logs(
     return result
 
 
-def _refuse_same_flights(records: Sequence[Record]) -> None:
-    for one, other in itertools.combinations(records, 2):
-        if np.array_equal(one.rates, other.rates):
-            raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
+def _fit_and_predict(
+    fitted: Sequence[_Usable], tested: Sequence[_Usable], start: Path, vehicle: Vehicle, *, wind: bool
+) -> tuple[Identification, PredictionErrors]:
+    """Fit some logs, and predict others; without others, what is held out of those that are fitted."""
+    records = [log.record for log in fitted]
+    predicted = records
+    fitted_spans = []
+    held_spans = []
+    if tested:
+        predicted = [log.record for log in tested]
+        fitted_spans = [log.spans for log in fitted]
+        held_spans = [log.spans for log in tested]
+    else:
+        for log in fitted:
+            first, last = hold_out(log.record, log.spans)
+            fitted_spans.append(first)
+            held_spans.append(last)
+    try:
+        identification = identify_records(records, fitted_spans, vehicle, wind=wind)
+    except ParameterError as error:
+        if error.owner != "vehicle":
+            raise
+        raise InputError(
+            f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
+            "range, or what was kept and does not suit what was identified"
+        ) from None
+    return identification, predict(predicted, held_spans, identification, vehicle, fitted=not tested)
+
+
+def _refuse_same_flights(logs: Sequence[_Usable]) -> None:
+    for one, other in itertools.combinations(logs, 2):
+        if np.array_equal(one.record.rates, other.record.rates):
+            raise InputError(f"{one.record.name} and {other.record.name} are the same flight: name it once")
 
 
 def _usable(
@@ -335,8 +349,8 @@ def _usable(
     for path in paths:
         try:
             record = read_record(path, poles=poles, columns=columns)
-            with judging(record.name):
-                airborne = spans(record, vehicle)
+            with fitting_errors(record.name):
+                airborne = airborne_spans(record, vehicle)
                 notes = check_log(record, vehicle, airborne)
         except InputError as error:
             if isinstance(error, MissingPackageError) or not path.exists():
@@ -377,8 +391,8 @@ def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell
     else:
         start = f"{estimate.start:.4g}"
     value = f"{rounded(estimate.value, estimate):.7g}"
-    found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
-    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), found)
+    judged = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
+    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), judged)
 
 
 def _disturbance(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.signal import filtfilt
 
 from quadsim.errors import InputError
-from quadsim.features.identify.model import Parameters, commanded
-from quadsim.features.identify.record import Record
+from quadsim.features.identify.model import Parameters, demanded_speeds
+from quadsim.features.identify.record import Record, in_parts
 from quadsim.features.identify.rotor_order import AGREEING, EXPLAINED, LAGS, explained_at_lag
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -41,9 +41,9 @@ def check_against_commands(record: Record, parts: Sequence[slice], vehicle: Vehi
         voltage = 0.0
     else:
         voltage = float(np.nanmean(record.voltage))
-    commands = commanded(record, vehicle, Parameters.of(vehicle, voltage=voltage))
-    speeds = np.concatenate([np.asarray(record.speeds)[part] for part in parts])
-    targets = np.concatenate([commands[part] for part in parts])
+    commands = demanded_speeds(record, vehicle, Parameters.of(vehicle, voltage=voltage))
+    speeds = in_parts(np.asarray(record.speeds), parts)
+    targets = in_parts(commands, parts)
     if np.allclose(speeds, targets * (speeds.mean() / targets.mean()), rtol=1e-6):
         raise InputError(f"{record.name}: the measured speeds are the commands: leave them out")
     ratios = np.median(speeds, axis=0) / np.maximum(np.median(targets, axis=0), 1e-9)
@@ -72,7 +72,7 @@ def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Ve
     Raises:
         InputError: there is one.
     """
-    squares = np.concatenate([np.square(np.asarray(record.speeds)[part]) for part in parts]).mean(axis=0)
+    squares = np.square(in_parts(np.asarray(record.speeds), parts)).mean(axis=0)
     thrusts = squares * (vehicle.hover_speeds.mean() / vehicle.hover_speeds) ** 2
     spins = np.array(vehicle.rotor_spins, float)
     arms = vehicle.hubs[:, :2] / vehicle.longest_arm
@@ -109,11 +109,11 @@ def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle)
         InputError: behind a lag they explain roll and pitch far better.
     """
     behind_lags = [explained_at_lag(record, parts, vehicle, lag) for lag in LAGS[1:]]
-    best = int(np.argmax([shares.mean() for shares in behind_lags]))
-    behind = behind_lags[best]
-    filtered = [_filtered(record, parts, tau) for tau in SMOOTHING]
-    without_lag = [explained_at_lag(smooth, parts, vehicle, 0.0) for smooth in filtered]
-    beside = max(without_lag, key=lambda shares: float(shares.mean()))
+    without_lag = []
+    for tau in SMOOTHING:
+        without_lag.append(explained_at_lag(_filtered(record, parts, tau), parts, vehicle, 0.0))
+    best, behind = _best_explained(behind_lags)
+    _, beside = _best_explained(without_lag)
     gain = (1.0 - beside.mean()) / max(1.0 - behind.mean(), 1e-9)
     agreeing = (behind > beside).mean()
     if behind.mean() > EXPLAINED and gain > LAGGING_BETTER and agreeing >= AGREEING - 0.05:
@@ -122,6 +122,12 @@ def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle)
             f"does behind commands ({behind.mean():.0%} of roll and pitch explained, {beside.mean():.0%} without): "
             "name them commands, u1..u4"
         )
+
+
+def _best_explained(shares: Sequence[Array]) -> tuple[int, Array]:
+    """The shares that are the largest in the mean, and their place."""
+    best = int(np.argmax([of_blocks.mean() for of_blocks in shares]))
+    return best, shares[best]
 
 
 def _filtered(record: Record, parts: Sequence[slice], tau: float) -> Record:

@@ -24,7 +24,7 @@ _ROUGHNESS: Final = 0.3  # of a smoothing spline per sample: what takes less tha
 
 
 @dataclass(frozen=True, kw_only=True)
-class Turning:
+class RotorMotion:
     """Four rotors over the N - 1 periods between N samples."""
 
     speeds: Array  # (N, 4) at the samples [rad/s]
@@ -36,12 +36,12 @@ class Turning:
         """(N - 1, 4) of the speed over each period [rad/s]."""
         return self.speeds[1:] - self.speeds[:-1]
 
-    def during(self, periods: Indices) -> Turning:
+    def during(self, periods: Indices) -> RotorMotion:
         """The same in some periods alone, as if one followed the other."""
         change = self.change[periods]
         speeds = np.zeros((len(periods) + 1, N_ROTORS))
         np.cumsum(change, axis=0, out=speeds[1:])
-        return Turning(speeds=speeds, mean=self.mean[periods], square=self.square[periods])
+        return RotorMotion(speeds=speeds, mean=self.mean[periods], square=self.square[periods])
 
 
 def start_lag(vehicle: Vehicle) -> float:
@@ -49,7 +49,7 @@ def start_lag(vehicle: Vehicle) -> float:
     return vehicle.rotor_rise or vehicle.rotor_fall or _TYPICAL_LAG
 
 
-def lagging(commands: Array, period: float, *, rise: float, fall: float, delay: float) -> Turning:
+def lagged_rotors(commands: Array, period: float, *, rise: float, fall: float, delay: float) -> RotorMotion:
     """Rotors that follow commands (N, 4) [rad/s], each held for a period [s] from `delay` [s] after its sample.
 
     A time constant of 0 is for at once.  They start at the first command.
@@ -80,7 +80,7 @@ def lagging(commands: Array, period: float, *, rise: float, fall: float, delay: 
     lost = gap * tau * (1.0 - decay)
     area = targets * held + lost  # integral of the speed over each piece, and of its square
     energy = targets**2 * held + 2.0 * targets * lost + 0.5 * gap**2 * tau * (1.0 - decay**2)
-    return Turning(
+    return RotorMotion(
         speeds=np.ascontiguousarray(speeds[:, ::2].T),
         mean=(area[:, ::2] + area[:, 1::2]).T / period,
         square=(energy[:, ::2] + energy[:, 1::2]).T / period,
@@ -98,17 +98,17 @@ def _pieces(commands: Array, period: float, delay: float) -> tuple[Array, Array]
     return rows.reshape(len(held), N_ROTORS).T, held
 
 
-def measured(speeds: Array, period: float, *, delay: float) -> Turning:
+def measured_rotors(speeds: Array, period: float, *, delay: float) -> RotorMotion:
     """Rotors whose speeds (N, 4) [rad/s] were logged `delay` [s] after they were turning so; linear in between."""
     samples = np.arange(len(speeds))
     at_samples = interpolated(samples + delay / period, samples, speeds)
     before = at_samples[:-1]
     after = at_samples[1:]
     square = (before**2 + before * after + after**2) / 3.0
-    return Turning(speeds=at_samples, mean=0.5 * (before + after), square=square)
+    return RotorMotion(speeds=at_samples, mean=0.5 * (before + after), square=square)
 
 
-def smoothed(speeds: Array) -> Array:
+def smoothed_speeds(speeds: Array) -> Array:
     """Measured speeds (N, 4) [rad/s] without their noise, which would make torques look larger than they are."""
     samples = np.arange(len(speeds), dtype=float)
     columns = []

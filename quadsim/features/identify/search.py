@@ -16,14 +16,21 @@ import numpy as np
 from scipy.signal import lfilter
 
 from quadsim.features.identify.estimate import VECTORS, field_of, number_in
-from quadsim.features.identify.model import INCREMENTS, Parameters, Stretch, mean_voltage, predicted_increments, turning
+from quadsim.features.identify.model import (
+    INCREMENTS,
+    Parameters,
+    Segment,
+    mean_voltage,
+    predicted_increments,
+    rotor_motion,
+)
 from quadsim.features.identify.record import Record
-from quadsim.features.identify.rotors import Turning, measured, start_lag
+from quadsim.features.identify.rotors import RotorMotion, measured_rotors, start_lag
 from quadsim.fields import floor_of
 from quadsim.state import Array, Indices
 from quadsim.vehicle import LARGEST, VEHICLE_UNITS, Vehicle
 
-SETTLING: Final = 0.5  # time [s] after a stretch begins until the rotors have forgotten the speeds assumed there
+SETTLING: Final = 0.5  # time [s] after a segment begins until the rotors have forgotten the speeds assumed there
 LONGEST_FORCE: Final = 2.0
 """Time [s] that an unknown force lasts: one that may last for ever would carry the weight in the thrust's place."""
 LIFT_DEVIATION: Final = 0.002
@@ -38,14 +45,14 @@ DRAG_AREAS: Final = (1.0, 1.0, 2.0)  # along x, y, z to each other, where the st
 _LAG_RATIO_DEVIATION: Final = 0.5  # standard deviation of log(rise / fall)
 
 _KNOT_SPACING: Final = 0.5  # time between two instants of the wind [s], where `_MAX_KNOTS` allow
-_MAX_KNOTS: Final = 120  # of all stretches
-_WIND_DEVIATION: Final = (2.0, 2.0, 0.7)  # standard deviation of the mean wind of a stretch, world axes [m/s]
+_MAX_KNOTS: Final = 120  # of all segments
+_WIND_DEVIATION: Final = (2.0, 2.0, 0.7)  # standard deviation of the mean wind of a segment, world axes [m/s]
 _WIND_CHANGE: Final = 0.2  # standard deviation of its change in one second, over that of the mean
 
 _ORDER: Final = 2  # of A and C
 _FIRST_REFLECTIONS: Final = (1.0, 0.0, -1.5, 0.5)  # reflection coefficients of A and C, before tanh
 _REFLECTION_DEVIATION: Final = 3.0  # standard deviation of their priors
-_FIRST_ERROR_DEVIATION: Final = 4.0  # the same of the error of a stretch's first sample, in sigma
+_FIRST_ERROR_DEVIATION: Final = 4.0  # the same of the error of a segment's first sample, in sigma
 
 # of the search: its steps, how often and how far each is shortened, and the likelihood's gain that ends it
 _MAX_STEPS: Final = 60
@@ -72,7 +79,7 @@ class FreeParameter(NamedTuple):
     scale: float | None  # None for the logarithm
     deviation: float | None  # of the prior, in units of x; None without
     flight: int | None = None  # whose own it is; None for one of the vehicle
-    part: int | None = None  # of the stretch whose own it is
+    segment: int | None = None  # of the segment whose own it is
 
     def value(self, x: float) -> float:
         """The number itself; one that is positive by nature stays within what a vehicle's numbers may be."""
@@ -89,26 +96,31 @@ class FreeParameter(NamedTuple):
         return (value - self.start) / self.scale
 
 
-def _free_parameters(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterator[FreeParameter]:
+def _free_parameters(vehicle: Vehicle, segments: Sequence[Segment], *, wind: bool) -> Iterator[FreeParameter]:
     """What is searched for, from the vehicle of the start file on."""
     yield from _of_vehicle(vehicle)
-    yield from _of_rotor_response(vehicle, parts[0].record)
-    for flight in range(1 + parts[-1].flight):
+    yield from _of_rotor_response(vehicle, segments[0].record)
+    for flight in range(1 + segments[-1].flight):
         yield FreeParameter("delay", 0.0, 0.005, 4.0, flight)
         yield FreeParameter("offset_x", 0.0, 0.01 * vehicle.longest_arm, 10.0, flight)
         yield FreeParameter("offset_y", 0.0, 0.01 * vehicle.longest_arm, 10.0, flight)
     if not wind:
         return
-    most_knots = max(2, _MAX_KNOTS // len(parts))
-    for i, part in enumerate(parts):
-        knots = int(np.clip(np.ceil(part.seconds / _KNOT_SPACING), 2, most_knots))
+    most_knots = max(2, _MAX_KNOTS // len(segments))
+    for i, segment in enumerate(segments):
+        knots = int(np.clip(np.ceil(segment.seconds / _KNOT_SPACING), 2, most_knots))
         for _ in range(knots):
             for deviation in _WIND_DEVIATION:
-                yield FreeParameter("wind", 0.0, deviation, knots**0.5, part.flight, i)
+                yield FreeParameter("wind", 0.0, deviation, knots**0.5, segment.flight, i)
 
 
 def _of_vehicle(vehicle: Vehicle) -> Iterator[FreeParameter]:
-    """Numbers of thrust, inertia, drag and torque."""
+    """Numbers of thrust, inertia, drag and torque.
+
+    Where the start has none, a number begins at a typical one: a rotor drag of 2 % of the weight per m/s, a body drag
+    of a quarter of the arm's square, 6e-4 of inertia_z for a rotor's.  Scales are what acts in hover at 1 m/s or 1
+    rad/s: moments of 1 % of weight times arm, a damping of inertia, an inflow that takes 2 % of the thrust.
+    """
     weight = vehicle.mass * vehicle.gravity
     arm = vehicle.longest_arm
     hover = vehicle.hover_speed
@@ -161,7 +173,7 @@ class _JointPrior(NamedTuple):
 
 
 class _Linearised(NamedTuple):
-    """Innovations of a stretch, and the lift that its blocks lack, with their slopes by all X numbers of x."""
+    """Innovations of a segment, and the lift that its blocks lack, with their slopes by all X numbers of x."""
 
     innovations: Array  # (N, 6)
     slopes: Array  # (N, 6, X)
@@ -170,7 +182,7 @@ class _Linearised(NamedTuple):
 
 
 class Search:
-    """The parameters of all stretches at once, and what their innovations say of them.
+    """The parameters of all segments at once, and what their innovations say of them.
 
     x has the free parameters, then the noise model of each flight and axis, then the errors of first samples.  A loop
     that feeds torque back through the commands does not bias the estimate, as each e_k is predicted from commands and
@@ -182,57 +194,67 @@ class Search:
     share no noise with the measured ones: sum Z' e = 0 in place of sum J' e = 0.
 
     Args:
-        parts: the stretches, flight by flight.
+        segments: the segments, flight by flight.
         vehicle: the start.
         wind: whether the air may move.
         fixed: numbers that are not searched for, by name, in SI units.
     """
 
     def __init__(
-        self, parts: Sequence[Stretch], vehicle: Vehicle, *, wind: bool, fixed: Mapping[str, float] | None = None
+        self, segments: Sequence[Segment], vehicle: Vehicle, *, wind: bool, fixed: Mapping[str, float] | None = None
     ) -> None:
-        self.parts = parts
+        self.segments = segments
         self.vehicle = vehicle
         self.fixed = fixed or {}
-        every = _free_parameters(vehicle, parts, wind=wind)
-        self.free = [parameter for parameter in every if parameter.name not in self.fixed]
-        self.voltage = mean_voltage(parts)
-        self.flight_count = 1 + parts[-1].flight
+        candidates = _free_parameters(vehicle, segments, wind=wind)
+        self.free = [parameter for parameter in candidates if parameter.name not in self.fixed]
+        self.voltage = mean_voltage(segments)
+        self.flight_count = 1 + segments[-1].flight
         self._free_count = len(self.free)
         reflections = [*_FIRST_REFLECTIONS] * len(INCREMENTS) * self.flight_count
-        first_errors = np.zeros(len(INCREMENTS) * len(parts))
-        self._first_errors = self._free_count + len(reflections)  # where the errors of first samples begin in x
+        first_errors = np.zeros(len(INCREMENTS) * len(segments))
+        self._errors_begin = self._free_count + len(reflections)  # where the errors of first samples begin in x
         self.x = np.concatenate([np.zeros(self._free_count), reflections, first_errors])
-        self._weights = np.concatenate(
-            [
-                [_weight(parameter.deviation) for parameter in self.free],
-                np.full(len(reflections), _weight(_REFLECTION_DEVIATION)),
-                np.full(len(first_errors), _weight(_FIRST_ERROR_DEVIATION)),
-            ]
-        )
-        self._fading = math.exp(-parts[0].step / LONGEST_FORCE)
-        self._skip = [int(np.searchsorted(part.starts, int(SETTLING / part.record.period))) for part in parts]
+        deviations = [parameter.deviation for parameter in self.free]
+        deviations += [_REFLECTION_DEVIATION] * len(reflections)
+        deviations += [_FIRST_ERROR_DEVIATION] * len(first_errors)
+        self._weights = np.array([_weight(deviation) for deviation in deviations])
+        self._fading = math.exp(-segments[0].step / LONGEST_FORCE)
+        self._skip = []  # how many increments of each segment begin before its rotors have settled
+        for segment in segments:
+            settled = int(SETTLING / segment.record.period)
+            self._skip.append(int(np.searchsorted(segment.starts, settled)))
         self.settled = True  # whether instruments, if there are any, gave moments of inertia
         self.sigma = np.ones((self.flight_count, len(INCREMENTS)))  # of the innovations of each flight [rad/s, m/s]
-        self._winds = []  # (K, 3) where each stretch's wind is in x
-        for i in range(len(parts)):
-            places = [place for place, parameter in enumerate(self.free) if parameter.part == i]
+        self._winds = []  # (K, 3) where each segment's wind is in x
+        for i in range(len(segments)):
+            places = [place for place, parameter in enumerate(self.free) if parameter.segment == i]
             self._winds.append(np.array(places, int).reshape(-1, 3))
 
+    @property
+    def names(self) -> list[str]:
+        """The names of the free parameters, by place in x."""
+        return [parameter.name for parameter in self.free]
+
+    @property
+    def seconds(self) -> float:
+        """How long all segments fly [s]."""
+        return sum(segment.seconds for segment in self.segments)
+
     def in_steady_wind(self, x: Array) -> Array:
-        """The same numbers with the wind of each stretch at its mean."""
+        """The same numbers with the wind of each segment at its mean."""
         steady = x.copy()
         for wind in self._winds:
             if len(wind):
                 steady[wind] = x[wind].mean(axis=0)
         return steady
 
-    def parameters(self, x: Array, part: int) -> Parameters:
-        """The prediction's parameters for a stretch."""
-        flight = self.parts[part].flight
+    def parameters(self, x: Array, index: int) -> Parameters:
+        """The prediction's parameters for a segment."""
+        flight = self.segments[index].flight
         numbers: dict[str, Any] = {}
         for parameter, coordinate in zip(self.free, x, strict=False):
-            if parameter.part is None and parameter.flight in (None, flight):
+            if parameter.segment is None and parameter.flight in (None, flight):
                 numbers[parameter.name] = parameter.value(coordinate)
         numbers |= self.fixed
         numbers.setdefault("throttle_curve", self.vehicle.throttle_share)
@@ -240,22 +262,22 @@ class Search:
             numbers[name] = np.array([numbers.pop(f"{name}_{axis}") for axis in axes])
         areas = self.vehicle.body_drag or DRAG_AREAS
         numbers["body_drag"] = numbers["body_drag"] / areas[0] * np.array(areas)
-        if len(self._winds[part]):
-            numbers["wind"] = x[self._winds[part]] * _WIND_DEVIATION
+        if len(self._winds[index]):
+            numbers["wind"] = x[self._winds[index]] * _WIND_DEVIATION
         return Parameters(voltage=self.voltage, **numbers)
 
-    def misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:
-        """(N, 6) measured less predicted increments of a stretch, and its rotors."""
-        stretch = self.parts[part]
-        parameters = self.parameters(x, part)
+    def misfit(self, x: Array, index: int, rotors: RotorMotion | None = None) -> tuple[Array, RotorMotion]:
+        """(N, 6) measured less predicted increments of a segment, and its rotors."""
+        segment = self.segments[index]
+        parameters = self.parameters(x, index)
         if rotors is None:
-            rotors = turning(stretch.record, self.vehicle, parameters)
-        misfit = stretch.misfit(predicted_increments(stretch.motion, rotors, self.vehicle, parameters))
-        return misfit[self._skip[part] :], rotors
+            rotors = rotor_motion(segment.record, self.vehicle, parameters)
+        misfit = segment.misfit(predicted_increments(segment.motion, rotors, self.vehicle, parameters))
+        return misfit[self._skip[index] :], rotors
 
-    def _filtered(self, misfit: Array, x: Array, part: int, axis: int) -> Array:
+    def _filtered(self, misfit: Array, x: Array, index: int, axis: int) -> Array:
         """A misfit (N, ...) of an axis through A(z) / C(z)."""
-        noise = self._noise_places(part, axis)
+        noise = self._noise_places(index, axis)
         reflections = x[noise.start : noise.stop]
         top = _polynomial(np.tanh(reflections[:_ORDER]))
         bottom = _polynomial(np.tanh(reflections[_ORDER:]))
@@ -263,38 +285,38 @@ class Search:
             top = self._fading ** np.arange(_ORDER + 1) * top
         return np.asarray(lfilter(top, bottom, misfit, axis=0))
 
-    def _noise_places(self, part: int, axis: int) -> range:
-        """Where in x the noise model of an axis of a stretch is."""
-        first = self._free_count + 2 * _ORDER * (len(INCREMENTS) * self.parts[part].flight + axis)
+    def _noise_places(self, index: int, axis: int) -> range:
+        """Where in x the noise model of an axis of a segment is."""
+        first = self._free_count + 2 * _ORDER * (len(INCREMENTS) * self.segments[index].flight + axis)
         return range(first, first + 2 * _ORDER)
 
-    def _first_error_place(self, part: int, axis: int) -> int:
-        """Where in x the error of the first sample of an axis of a stretch is."""
-        return self._first_errors + len(INCREMENTS) * part + axis
+    def _first_error_place(self, index: int, axis: int) -> int:
+        """Where in x the error of the first sample of an axis of a segment is."""
+        return self._errors_begin + len(INCREMENTS) * index + axis
 
-    def _innovations_of_axis(self, misfit: Array, x: Array, part: int, axis: int) -> Array:
+    def _innovations_of_axis(self, misfit: Array, x: Array, index: int, axis: int) -> Array:
         """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less the error of its sample."""
-        driven = misfit[:, axis].copy()
-        driven[0] += x[self._first_error_place(part, axis)] * self.sigma[self.parts[part].flight, axis]
-        return self._filtered(driven, x, part, axis)
+        corrected = misfit[:, axis].copy()
+        corrected[0] += x[self._first_error_place(index, axis)] * self.sigma[self.segments[index].flight, axis]
+        return self._filtered(corrected, x, index, axis)
 
-    def _innovations(self, misfit: Array, x: Array, part: int) -> Array:
-        columns = [self._innovations_of_axis(misfit, x, part, axis) for axis in range(len(INCREMENTS))]
+    def _innovations(self, misfit: Array, x: Array, index: int) -> Array:
+        columns = [self._innovations_of_axis(misfit, x, index, axis) for axis in range(len(INCREMENTS))]
         return np.stack(columns, axis=1)
 
     def innovations(self, x: Array) -> list[Array]:
-        """(N, 6) of each stretch."""
+        """(N, 6) of each segment."""
         innovations = []
-        for i in range(len(self.parts)):
+        for i in range(len(self.segments)):
             misfit, _ = self.misfit(x, i)
             innovations.append(self._innovations(misfit, x, i))
         return innovations
 
     def _by_flight(self, rows: Sequence[Array]) -> list[Array]:
-        """What the stretches of each flight have, together."""
+        """What the segments of each flight have, together."""
         by_flight: list[list[Array]] = [[] for _ in range(self.flight_count)]
-        for part, rows_of_part in zip(self.parts, rows, strict=True):
-            by_flight[part.flight].append(rows_of_part)
+        for segment, rows_of_segment in zip(self.segments, rows, strict=True):
+            by_flight[segment.flight].append(rows_of_segment)
         return [np.concatenate(flight) for flight in by_flight]
 
     def prior(self, x: Array) -> tuple[float, NormalEquations]:
@@ -313,20 +335,23 @@ class Search:
 
     def _joint_priors(self, x: Array) -> Iterator[_JointPrior]:
         """A body that is about flat, rotors that rise about as fast as they fall, and wind that changes slowly."""
-        places = {parameter.name: place for place, parameter in enumerate(self.free)}
+        places = dict(zip(self.names, range(self._free_count), strict=True))
         if "inertia_z" in places:
             inertia = self.parameters(x, 0).inertia
             level = inertia[0] + inertia[1]
             shares = {"inertia_z": 1.0, "inertia_x": -inertia[0] / level, "inertia_y": -inertia[1] / level}
-            slopes = {places[name]: share for name, share in shares.items() if name in places}
+            slopes = {}
+            for name, share in shares.items():
+                if name in places:
+                    slopes[places[name]] = share
             yield _JointPrior(slopes, float(np.log(inertia[2] / level / FLAT_BODY)), FLAT_BODY_DEVIATION)
         if "rotor_rise" in places and "rotor_fall" in places:
             rise = places["rotor_rise"]
             fall = places["rotor_fall"]
             ratio = self.free[rise].value(x[rise]) / self.free[fall].value(x[fall])
             yield _JointPrior({rise: 1.0, fall: -1.0}, float(np.log(ratio)), _LAG_RATIO_DEVIATION)
-        for part, wind in zip(self.parts, self._winds, strict=True):
-            deviation = _WIND_CHANGE * math.sqrt(part.seconds / max(len(wind) - 1, 1))
+        for segment, wind in zip(self.segments, self._winds, strict=True):
+            deviation = _WIND_CHANGE * math.sqrt(segment.seconds / max(len(wind) - 1, 1))
             for before, after in zip(wind[:-1].flat, wind[1:].flat, strict=True):
                 yield _JointPrior({before: -1.0, after: 1.0}, x[after] - x[before], deviation)
 
@@ -334,7 +359,7 @@ class Search:
         """Negative logarithm of the likelihood, each axis at its most likely variance, and of the priors."""
         innovations = []
         lifts = []
-        for i in range(len(self.parts)):
+        for i in range(len(self.segments)):
             misfit, _ = self.misfit(x, i)
             innovations.append(self._innovations(misfit, x, i))
             lifts.append(self._lift(misfit[:, -1], i))
@@ -348,12 +373,12 @@ class Search:
             return cost
         return np.inf
 
-    def misfits(self, x: Array, part: int) -> tuple[Array, Array]:
-        """Misfit (N, 6) of a stretch's increments and its slopes (N, 6, P) by every number that is sought."""
-        misfit, rotors = self.misfit(x, part)
+    def misfits(self, x: Array, index: int) -> tuple[Array, Array]:
+        """Misfit (N, 6) of a segment's increments and its slopes (N, 6, P) by every free parameter."""
+        misfit, rotors = self.misfit(x, index)
         slopes = np.zeros((*misfit.shape, self._free_count))
         for place, parameter in enumerate(self.free):
-            if parameter.part is not None or parameter.flight not in (None, self.parts[part].flight):
+            if parameter.segment is not None or parameter.flight not in (None, self.segments[index].flight):
                 continue
             step = _SCALED_STEP
             if parameter.scale is None:
@@ -361,58 +386,57 @@ class Search:
             moved = x.copy()
             moved[place] += step
             if parameter.name in _ROTOR_PARAMETERS:
-                moved_misfit, _ = self.misfit(moved, part)
+                moved_misfit, _ = self.misfit(moved, index)
             else:
-                moved_misfit, _ = self.misfit(moved, part, rotors)
+                moved_misfit, _ = self.misfit(moved, index, rotors)
             slopes[:, :, place] = (moved_misfit - misfit) / step
-        self._fill_wind_slopes(slopes, misfit, rotors, x, part)
+        self._fill_wind_slopes(slopes, misfit, rotors, x, index)
         return misfit, slopes
 
-    def _fill_wind_slopes(self, slopes: Array, misfit: Array, rotors: Turning, x: Array, part: int) -> None:
+    def _fill_wind_slopes(self, slopes: Array, misfit: Array, rotors: RotorMotion, x: Array, index: int) -> None:
         """Write the slopes by the wind: as it is linear between its knots, so is what a change of all of them does."""
-        begun = self.parts[part].starts[self._skip[part] :]
-        when = begun / max(len(self.parts[part].motion.rates) - 1, 1)
-        for wind in self._winds[part].T:
+        begun = self.segments[index].starts[self._skip[index] :]
+        when = begun / max(len(self.segments[index].motion.rates) - 1, 1)
+        for wind in self._winds[index].T:
             moved = x.copy()
             moved[wind] += _SCALED_STEP
-            moved_misfit, _ = self.misfit(moved, part, rotors)
+            moved_misfit, _ = self.misfit(moved, index, rotors)
             slope = (moved_misfit - misfit) / _SCALED_STEP
             knots = np.linspace(0.0, 1.0, len(wind))
             for hat, place in zip(np.eye(len(wind)), wind, strict=True):
                 slopes[:, :, place] = slope * np.interp(when, knots, hat)[:, None]
 
-    def rows(self, part: int) -> list[Indices]:
-        """The samples of each block of a stretch."""
-        flown = sum(part.seconds for part in self.parts)
-        size = len(self.parts[part].increments) - self._skip[part]
-        seconds = size * self.parts[part].step
-        block = max(SHORTEST_BLOCK, flown / _MAX_BLOCKS)
-        count = max(math.ceil(MIN_BLOCKS / len(self.parts)), round(seconds / block))
+    def rows(self, index: int) -> list[Indices]:
+        """The samples of each block of a segment."""
+        size = len(self.segments[index].increments) - self._skip[index]
+        seconds = size * self.segments[index].step
+        block = max(SHORTEST_BLOCK, self.seconds / _MAX_BLOCKS)
+        count = max(math.ceil(MIN_BLOCKS / len(self.segments)), round(seconds / block))
         return np.array_split(np.arange(size), count)
 
-    def _lift(self, misfit: Array, part: int) -> Array:
+    def _lift(self, misfit: Array, index: int) -> Array:
         """Mean misfit (N, ...) of vz in each block, over what is allowed of it: thrust has to carry the weight."""
-        blocks = self.rows(part)
+        blocks = self.rows(index)
         means = np.stack([misfit[rows].mean(axis=0) for rows in blocks])
-        deviation = LIFT_DEVIATION * math.sqrt(len(blocks) * len(self.parts))
-        return means / (deviation * self.vehicle.gravity * self.parts[part].step)
+        deviation = LIFT_DEVIATION * math.sqrt(len(blocks) * len(self.segments))
+        return means / (deviation * self.vehicle.gravity * self.segments[index].step)
 
-    def _linearised(self, part: int) -> _Linearised:
-        """The innovations of a stretch and the lift of its blocks at x, with their slopes."""
+    def _linearised(self, index: int) -> _Linearised:
+        """The innovations of a segment and the lift of its blocks at x, with their slopes."""
         x = self.x
-        misfit, misfit_slopes = self.misfits(x, part)
-        innovations = self._innovations(misfit, x, part)
+        misfit, misfit_slopes = self.misfits(x, index)
+        innovations = self._innovations(misfit, x, index)
         slopes = np.zeros((*innovations.shape, len(x)))
         for axis in range(len(INCREMENTS)):
-            slopes[:, axis, : self._free_count] = self._filtered(misfit_slopes[:, axis], x, part, axis)
-            for place in (*self._noise_places(part, axis), self._first_error_place(part, axis)):
+            slopes[:, axis, : self._free_count] = self._filtered(misfit_slopes[:, axis], x, index, axis)
+            for place in (*self._noise_places(index, axis), self._first_error_place(index, axis)):
                 moved = x.copy()
                 moved[place] += _NOISE_STEP
-                change = self._innovations_of_axis(misfit, moved, part, axis) - innovations[:, axis]
+                change = self._innovations_of_axis(misfit, moved, index, axis) - innovations[:, axis]
                 slopes[:, axis, place] = change / _NOISE_STEP
-        lift_slopes = np.zeros((len(self.rows(part)), len(x)))
-        lift_slopes[:, : self._free_count] = self._lift(misfit_slopes[:, -1], part)
-        return _Linearised(innovations, slopes, self._lift(misfit[:, -1], part), lift_slopes)
+        lift_slopes = np.zeros((len(self.rows(index)), len(x)))
+        lift_slopes[:, : self._free_count] = self._lift(misfit_slopes[:, -1], index)
+        return _Linearised(innovations, slopes, self._lift(misfit[:, -1], index), lift_slopes)
 
     def blocks(self, *, instrumented: bool = False) -> list[NormalEquations]:
         """Normal equations of the log's parts, each of `SHORTEST_BLOCK` or longer but for `MIN_BLOCKS`, without priors.
@@ -420,12 +444,12 @@ class Search:
         With the instruments that there are, if `instrumented`.
         """
         blocks = []
-        for i, part in enumerate(self.parts):
+        for i, segment in enumerate(self.segments):
             innovations, slopes, lift, lift_slopes = self._linearised(i)
             instruments = None
-            if instrumented and part.instrument_speeds is not None and self.settled:
-                instruments = self._instruments(i, slopes, part.instrument_speeds)
-            sigma = self.sigma[part.flight]
+            if instrumented and segment.instrument_speeds is not None and self.settled:
+                instruments = self._instruments(i, slopes, segment.instrument_speeds)
+            sigma = self.sigma[segment.flight]
             for rows, mean, slope in zip(self.rows(i), lift, lift_slopes, strict=True):
                 J = np.vstack([(slopes[rows] / sigma[:, None]).reshape(-1, len(self.x)), slope])
                 Z = J
@@ -437,36 +461,35 @@ class Search:
 
     def _instrumented_places(self) -> list[int]:
         """Where in x the moments of inertia are that the thrust turns: for yaw, the commands predict too little."""
-        names = ("inertia_x", "inertia_y")
-        return [place for place, parameter in enumerate(self.free) if parameter.name in names]
+        return [place for place, name in enumerate(self.names) if name in ("inertia_x", "inertia_y")]
 
-    def _instruments(self, part: int, slopes: Array, speeds: Array) -> Array:
+    def _instruments(self, index: int, slopes: Array, speeds: Array) -> Array:
         """Slopes (N, 6, X) with those by the moments of inertia at the speeds (N, 4) that the commands predict."""
-        delay = self.parameters(self.x, part).delay
-        rotors = measured(speeds, self.parts[part].record.period, delay=delay)
-        misfit, _ = self.misfit(self.x, part, rotors)
+        delay = self.parameters(self.x, index).delay
+        rotors = measured_rotors(speeds, self.segments[index].record.period, delay=delay)
+        misfit, _ = self.misfit(self.x, index, rotors)
         instruments = slopes.copy()
         for place in self._instrumented_places():
             moved = self.x.copy()
             moved[place] += _LOG_STEP
-            moved_misfit, _ = self.misfit(moved, part, rotors)
+            moved_misfit, _ = self.misfit(moved, index, rotors)
             misfit_slopes = (moved_misfit - misfit) / _LOG_STEP
             for axis in range(len(INCREMENTS)):
-                instruments[:, axis, place] = self._filtered(misfit_slopes[:, axis], self.x, part, axis)
+                instruments[:, axis, place] = self._filtered(misfit_slopes[:, axis], self.x, index, axis)
         return instruments
 
     def flight_of_blocks(self) -> list[int]:
         """The flight of each of `blocks`."""
         flights = []
-        for i, part in enumerate(self.parts):
-            flights += [part.flight] * len(self.rows(i))
+        for i, segment in enumerate(self.segments):
+            flights += [segment.flight] * len(self.rows(i))
         return flights
 
     def run(self) -> None:
         """Find the parameters: the most likely ones; then, where there are instruments, those orthogonal to them."""
         self._maximise_likelihood()
         self.settled = True
-        has_instruments = all(part.instrument_speeds is not None for part in self.parts)
+        has_instruments = all(segment.instrument_speeds is not None for segment in self.segments)
         if has_instruments and self._instrumented_places():
             likely = self.x
             self.settled = self._solve_with_instruments()
@@ -489,9 +512,8 @@ class Search:
     def _with_priors(self, blocks: Sequence[NormalEquations]) -> tuple[Array, Array]:
         """H and g of all blocks and the priors together."""
         _, prior = self.prior(self.x)
-        H = sum(block.H for block in blocks) + prior.H
-        g = sum(block.g for block in blocks) + prior.g
-        return H, g
+        whole = joined(blocks)
+        return whole.H + prior.H, whole.g + prior.g
 
     def _maximise_likelihood(self) -> None:
         """Gauss-Newton steps, damped by Levenberg and Marquardt."""
@@ -519,21 +541,29 @@ class Search:
         before = self.sigma
         by_flight = self._by_flight(self.innovations(self.x))
         self.sigma = np.stack([np.sqrt((e**2).mean(axis=0)) for e in by_flight])
-        flights = [part.flight for part in self.parts]
-        first_errors = self.x[self._first_errors :].reshape(-1, len(INCREMENTS))
+        flights = [segment.flight for segment in self.segments]
+        first_errors = self.x[self._errors_begin :].reshape(-1, len(INCREMENTS))
         first_errors *= (before / self.sigma)[flights]
 
     def adopt(self, other: Search) -> None:
-        """Begin where another search of the same stretches ended."""
+        """Begin where another search of the same segments ended."""
         coordinates: dict[Any, list[float]] = {}
         for parameter, coordinate in zip(other.free, other.x, strict=False):
-            owner = (parameter.name, parameter.flight, parameter.part)
+            owner = (parameter.name, parameter.flight, parameter.segment)
             coordinates.setdefault(owner, []).append(coordinate)
         for place, parameter in enumerate(self.free):
-            owner = (parameter.name, parameter.flight, parameter.part)
+            owner = (parameter.name, parameter.flight, parameter.segment)
             self.x[place] = coordinates[owner].pop(0)
         self.x[self._free_count :] = other.x[other._free_count :]
         self.sigma = other.sigma
+
+
+def joined(blocks: Sequence[NormalEquations]) -> NormalEquations:
+    """All blocks as one."""
+    H = np.sum([block.H for block in blocks], axis=0)
+    g = np.sum([block.g for block in blocks], axis=0)
+    S = np.sum([block.S for block in blocks], axis=0)
+    return NormalEquations(H, g, S)
 
 
 def _weight(deviation: float | None) -> float:

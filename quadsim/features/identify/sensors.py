@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label, maximum_filter1d, median_filter
 
 from quadsim.errors import InputError
-from quadsim.features.identify.series import Column, held, interpolated
+from quadsim.features.identify.series import Column, interpolated, latest_samples
 from quadsim.state import Array
 
 LONGEST_SPIKE: Final = 3  # samples, of which a log with a sample in `SPIKE_TIME` or more has one
@@ -266,47 +266,54 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
     if "speeds" not in series:
         return result, ()
     t, speeds = series["speeds"]
-    there = np.isfinite(speeds).all(axis=1)
+    there = np.asarray(np.isfinite(speeds).all(axis=1))
     if np.count_nonzero(there) < 2:
         return result, ()
-    commands = series.get("commands", series.get("throttle"))
-    period = float(np.median(np.diff(t)))
-    longest = max(round(LONGEST_HELD / period), 1)
     values = speeds.copy()
     notes = []
     for rotor in range(speeds.shape[1]):
-        others = np.median(np.delete(speeds, rotor, axis=1), axis=1)
-        turning = there & (np.nan_to_num(others) > CARRYING * np.quantile(others[there], 0.9))
-        if commands is not None:
-            command = np.nan_to_num(held(commands, t)[:, rotor])
-            largest_lately = maximum_filter1d(command, 2 * round(SLOWS_DOWN / period) + 1)
-            turning &= largest_lately > IDLE * command.max()
-        stopped = turning & ((speeds[:, rotor] == 0.0) | _stuck(speeds, rotor, longest))
+        turning = there & _has_to_turn(series, rotor, there)
+        stopped = turning & ((speeds[:, rotor] == 0.0) | _stuck(series["speeds"], rotor))
         if not stopped.any():
             continue
+        values[stopped] = np.nan
         row = int(np.argmax(stopped))
+        others = float(np.median(np.delete(speeds[row], rotor)))
         share = np.count_nonzero(stopped) / np.count_nonzero(turning)
         what = (
             f"{name}: the measured speed of rotor {rotor + 1} stays at {speeds[row, rotor]:.4g} rad/s from "
-            f"t = {t[row]:.6g} s on while the others turn at {others[row]:.4g}, in {share:.1%} of the time that they "
-            "turn"
+            f"t = {t[row]:.6g} s on while the others turn at {others:.4g}, in {share:.1%} of the time that they turn"
         )
         if share > MOST_STOPPED:
             advice = "mend it"
-            if commands is not None:
+            if "commands" in series or "throttle" in series:
                 advice = "mend it, or name the commands alone"
             raise InputError(f"{what}: its counter is dead, at most {MOST_STOPPED:.0%} is allowed: {advice}")
-        values[stopped] = np.nan
         notes.append(f"{what}: left out")
     result["speeds"] = Column(t=t, values=values)
     return result, tuple(notes)
 
 
-def _stuck(speeds: Array, rotor: int, longest: int) -> NDArray[np.bool_]:
+def _has_to_turn(series: Mapping[str, Column], rotor: int, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Samples (M,) in which the other rotors carry a vehicle, and a rotor's command, where logged, is no idle one."""
+    t, speeds = series["speeds"]
+    others = np.median(np.delete(speeds, rotor, axis=1), axis=1)
+    turning = np.nan_to_num(others) > CARRYING * np.quantile(others[there], 0.9)
+    commands = series.get("commands", series.get("throttle"))
+    if commands is not None:
+        command = np.nan_to_num(latest_samples(commands, t)[:, rotor])
+        lately = 2 * round(SLOWS_DOWN / float(np.median(np.diff(t)))) + 1
+        turning &= maximum_filter1d(command, lately) > IDLE * command.max()
+    return np.asarray(turning)
+
+
+def _stuck(samples: Column, rotor: int) -> NDArray[np.bool_]:
     """Samples (M,) in which a rotor keeps its speed for long while the others change theirs."""
+    t, speeds = samples
+    longest = round(LONGEST_HELD / float(np.median(np.diff(t))))
     unchanged = np.abs(np.diff(speeds, axis=0)) <= ROUNDING
     stuck = np.zeros(len(speeds), bool)
-    for run in runs(unchanged[:, rotor], longest):
+    for run in runs(unchanged[:, rotor], max(longest, 1)):
         changing = ~np.delete(unchanged[run], rotor, axis=1)
         if changing.mean() > 0.5:
             stuck[run.start : run.stop + 1] = True

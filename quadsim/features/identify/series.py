@@ -18,7 +18,7 @@ class Column(NamedTuple):
     values: Array  # (M,) or (M, n), NaN where there is none
 
 
-def held(column: Column, t: Array) -> Array:
+def latest_samples(column: Column, t: Array) -> Array:
     """The latest sample at each of some times (N,); before the first, that one."""
     latest = np.searchsorted(column.t, t, side="right") - 1
     rows = np.clip(latest, 0, len(column.t) - 1)

@@ -1,6 +1,6 @@
 """Tables as logs: CSV, Parquet, and quadsim's own `flight.parquet`, their columns by the names that are in use.
 
-A reader as those of autopilots' formats: it gives `record` columns by name, all on the clock of the table's rows.
+A reader like those of the autopilots' formats: it gives `record` columns by name, all on the clock of the table's rows.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _NAMES_IN_USE: Final = {*_TIMES_OF_ANY_UNIT, *_names_of(_NAMES), *_names_of(_TIM
 _WRITTEN_BY_QUADSIM: Final = b"speeds_before"  # in the metadata of its tables
 
 
-def read_columns(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_columns(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read a table's columns: those that a map names, and those with a name that is in use.
 
     A name is what stands before its unit in brackets, in any case; a map may also name a column in full.
@@ -79,8 +79,8 @@ def read_columns(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     logged = dict(zip(names, table.columns, strict=True))
     for full_name, column in zip(table.column_names, table.columns, strict=True):
         logged[full_name.strip()] = column
-    used = _NAMES_IN_USE | _names_of(given)
-    t = _time(path, logged, given)
+    used = _NAMES_IN_USE | _names_of(column_map)
+    t = _time(path, logged, column_map)
     columns = {}
     for name, column in logged.items():
         values = t  # of a column that nobody reads
@@ -136,9 +136,9 @@ def _numbers(path: Path, name: str, column: pa.ChunkedArray) -> Array:
         raise FileError(path, f"column {name} must be numbers ({str(error)[:80]})") from error
 
 
-def _time(path: Path, columns: Mapping[str, pa.ChunkedArray], given: Sequence[NamedQuantity]) -> Array:
+def _time(path: Path, columns: Mapping[str, pa.ChunkedArray], column_map: Sequence[NamedQuantity]) -> Array:
     """The time [s] of each row."""
-    mapped = [named for named in given if named.quantity == "t"]
+    mapped = [named for named in column_map if named.quantity == "t"]
     for named in (*mapped, *_TIMES):
         (name,) = named.columns
         if name in columns:

@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.features.identify.border import between, reading, stated_number
+from quadsim.features.identify.log_errors import reading_errors, scale_between, stated_number
 from quadsim.features.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
-from quadsim.features.identify.series import Column, held, on_one_clock
+from quadsim.features.identify.series import Column, latest_samples, on_one_clock
 from quadsim.vehicle import N_ROTORS
 
 ULOGS: Final = (".ulg", ".ulog")
@@ -42,14 +42,14 @@ _ADVICE: Final = "set SDLOG_PROFILE to 17, the default set and the high rate"
 _FIRST_MOTOR: Final = 101  # of PWM_MAIN_FUNCn
 
 
-def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_ulog(path: Path, column_map: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the topics of a ULog that are used: columns `topic.field`, each on the clock of its measurement.
 
     Raises:
         FileError: a parameter of it says nothing.
     """
     topics = [*_STATES]
-    for named in (*given, *_NAMES):
+    for named in (*column_map, *_NAMES):
         topics += [column.partition(".")[0] for column in named.columns]
     log = _parsed(path, topics)
     columns: dict[str, Column] = {}
@@ -89,19 +89,22 @@ def stated_rotors(path: Path) -> str:
     """
     if path.suffix.lower() not in ULOGS or not path.is_file():
         return ""
-    with reading(path, "ULog", "pyulog"):
+    with reading_errors(path, "ULog", "pyulog"):
         stated = _parsed(path, _STATES).initial_parameters
     if stated_number(path, stated, "CA_ROTOR_COUNT", 0, whole=True) != N_ROTORS:
         return ""
     hubs = []
     moments = []
+    spins = []
     for i in _ROTORS:
         hubs.append([stated_number(path, stated, f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XYZ"])
-        moments.append(stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05))
+        moment = stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05)
+        moments.append(moment)
+        spins.append(-1 if moment > 0.0 else 1)
     positions = np.round(np.array(hubs) * HALF_TURN, 4) + 0.0  # never -0
     values = {
         "rotor_positions": (positions.tolist(), "m"),
-        "rotor_spins": ([-1 if moment > 0.0 else 1 for moment in moments], "-"),
+        "rotor_spins": (spins, "-"),
         "drag_to_thrust": (round(float(np.abs(moments).mean()), 4), "m"),
     }
     lines = []
@@ -126,7 +129,7 @@ def _flying(columns: Mapping[str, Column]) -> Column | None:
     t = np.unique(np.concatenate([columns[name].t for name in known]))
     flying = np.ones(len(t), bool)
     for name in known:
-        flying &= held(columns[name], t) == flying_states[name]
+        flying &= latest_samples(columns[name], t) == flying_states[name]
     return Column(t, flying.astype(float))
 
 
@@ -136,14 +139,18 @@ def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
     for i in range(2 * N_ROTORS):
         function = stated_number(path, parameters, f"PWM_MAIN_FUNC{i + 1}", 0, whole=True)
         outputs_by_motor[function - _FIRST_MOTOR] = i
-    outputs = [outputs_by_motor.get(motor, motor) for motor in _ROTORS]
 
     def pulse(output: int, end: str, usual: float) -> float:
         names = (f"PWM_MAIN_{end}{output + 1}", f"PWM_MAIN_{end}", f"PWM_{end}")
         stated = [stated_number(path, parameters, name, -1.0) for name in names]
         return next((number for number in stated if number >= 0.0), usual)
 
-    low = [pulse(output, "MIN", 1000.0) for output in outputs]
-    high = [pulse(output, "MAX", 2000.0) for output in outputs]
-    columns = tuple(f"actuator_outputs.output[{output}]" for output in outputs)
-    return {"columns": columns, **between(path, "pulses of PWM_MAIN", low, high)}
+    columns = []
+    low = []
+    high = []
+    for motor in _ROTORS:
+        output = outputs_by_motor.get(motor, motor)
+        columns.append(f"actuator_outputs.output[{output}]")
+        low.append(pulse(output, "MIN", 1000.0))
+        high.append(pulse(output, "MAX", 2000.0))
+    return {"columns": tuple(columns), **scale_between(path, "pulses of PWM_MAIN", low, high)}

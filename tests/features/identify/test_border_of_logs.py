@@ -15,12 +15,12 @@ from flown_logs import COLUMNS, fly_eight, write_log
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, InputError
-from quadsim.features.identify.border import between, judging, reading, stated_number
-from quadsim.features.identify.checks import spans
+from quadsim.features.identify.checks import airborne_spans
+from quadsim.features.identify.log_errors import fitting_errors, reading_errors, scale_between, stated_number
 from quadsim.features.identify.quantities import read_map
 from quadsim.features.identify.record import read_record
 from quadsim.features.identify.report import identify_logs
-from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.rotors import lagged_rotors
 from quadsim.features.identify.search import FreeParameter
 from quadsim.flight.parquet import write_log as write_run
 from quadsim.rollout.flown import Flight
@@ -93,14 +93,14 @@ def test_a_column_that_stands_still_is_read_and_checked_or_refused(
     """Nothing else is raised, not even a warning."""
     start = load_vehicle(vehicle_path("hummingbird"))
     with contextlib.suppress(InputError):
-        spans(read_record(spoilt(tmp_path / "still.csv", eight, column, value, slice(None))), start)
+        airborne_spans(read_record(spoilt(tmp_path / "still.csv", eight, column, value, slice(None))), start)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 60])
 def test_a_log_of_few_rows_is_refused(tmp_path: Path, eight: Array, count: int) -> None:
     start = load_vehicle(vehicle_path("hummingbird"))
     with pytest.raises(InputError):
-        spans(read_record(table(tmp_path / "short.csv", eight[:count])), start)
+        airborne_spans(read_record(table(tmp_path / "short.csv", eight[:count])), start)
 
 
 def test_a_log_that_admits_no_fit_says_so(tmp_path: Path, eight: Array) -> None:
@@ -118,14 +118,14 @@ def test_a_log_that_admits_no_fit_says_so(tmp_path: Path, eight: Array) -> None:
 )
 def test_whatever_reading_raises_is_a_fault_of_the_log(error: Exception) -> None:
     named = rf"a\.log: is not a readable ULog \({type(error).__name__}: "
-    with pytest.raises(FileError, match=named), reading(Path("a.log"), "ULog", "pyulog"):
+    with pytest.raises(FileError, match=named), reading_errors(Path("a.log"), "ULog", "pyulog"):
         raise error
-    with pytest.raises(FileError, match="ours"), reading(Path("a.log"), "ULog"):
+    with pytest.raises(FileError, match="ours"), reading_errors(Path("a.log"), "ULog"):
         raise FileError(Path("b.log"), "ours")
 
 
 def test_whatever_a_fit_raises_is_a_fault_of_its_logs() -> None:
-    with pytest.raises(InputError, match="a, b"), judging("a, b"):
+    with pytest.raises(InputError, match="a, b"), fitting_errors("a, b"):
         np.linalg.solve(np.zeros((2, 2)), np.ones(2))
 
 
@@ -138,9 +138,9 @@ def test_what_a_log_states_of_itself_is_a_number_in_its_range(value: Any) -> Non
 
 
 def test_the_ends_of_an_output_are_in_order() -> None:
-    assert between(Path("a.ulg"), "pulses", 1000.0, 2000.0) == {"zero": 1000.0, "scale": 1e-3}
+    assert scale_between(Path("a.ulg"), "pulses", 1000.0, 2000.0) == {"zero": 1000.0, "scale": 1e-3}
     with pytest.raises(FileError, match=r"158\.0"):
-        between(Path("a.ulg"), "pulses", 158.0, 158.0)
+        scale_between(Path("a.ulg"), "pulses", 158.0, 158.0)
 
 
 # Rows that repeat the one before
@@ -175,7 +175,7 @@ def test_rest_is_not_repeated_rows(eight: Array, tmp_path: Path, rest: Callable[
         with_rounding(rows)
     path = tmp_path / "rest.csv"
     np.savetxt(path, rows, fmt="%.17g", delimiter=",", header=COLUMNS, comments="")
-    assert spans(read_record(path), load_vehicle(vehicle_path("hummingbird")))
+    assert airborne_spans(read_record(path), load_vehicle(vehicle_path("hummingbird")))
 
 
 def held_by_a_radio(path: Path, eight: Array, times: int, *, rounded: bool) -> Path:
@@ -203,7 +203,7 @@ def test_rows_that_a_radio_holds_are_left_out(eight: Array, tmp_path: Path, time
     assert record.fresh is not None
     assert record.fresh.sum() == pytest.approx(len(eight) / times, abs=5)
     assert re.match(r"radio\.csv: [56]\d% of its rows repeat", record.notes[0])
-    (part,) = spans(record, load_vehicle(vehicle_path("hummingbird")))
+    (part,) = airborne_spans(record, load_vehicle(vehicle_path("hummingbird")))
     assert part.stop - part.start > len(eight) - 2 * times
 
 
@@ -294,7 +294,7 @@ def test_rotors_without_lag_have_their_commands_at_once() -> None:
     """Also where a command comes at the sample itself: no time passes there, and 0 over 0 is nothing."""
     commands = np.random.default_rng(0).uniform(100.0, 200.0, (50, 4))
     for lag in (0.0, 1e-310, 1e-12):
-        turning = lagging(commands, 0.01, rise=lag, fall=lag, delay=0.0)
+        turning = lagged_rotors(commands, 0.01, rise=lag, fall=lag, delay=0.0)
         np.testing.assert_allclose(turning.mean, commands[:-1], rtol=1e-3)
         assert np.isfinite(turning.square).all()
 

@@ -19,7 +19,7 @@ from quadsim.assets import vehicle_path
 from quadsim.commands.cli import main
 from quadsim.errors import InputError, ParameterError
 from quadsim.features.identify.estimate import Identification, ParameterEstimate, number_in
-from quadsim.features.identify.model import Parameters, commanded, stretch
+from quadsim.features.identify.model import Parameters, demanded_speeds, prepare_segment
 from quadsim.features.identify.prediction import (
     HORIZONS,
     QUANTITIES,
@@ -189,9 +189,9 @@ def test_a_throttle_map_gives_the_speeds_of_the_throttle() -> None:
     columns = {name: np.zeros((40, 3)) for name in ("rates", "velocity")}
     throttle, level = np.stack([u] * 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
     record = Record(name="a", t=0.01 * np.arange(40), attitude=level, throttle=throttle, **columns)
-    speeds = commanded(record, mapped, Parameters.of(mapped))
+    speeds = demanded_speeds(record, mapped, Parameters.of(mapped))
     np.testing.assert_allclose(mapped.thrusts(speeds), top * (0.4 * throttle + 0.6 * throttle**2), rtol=1e-12)
-    search = Search([stretch(record, 0)], mapped, wind=False)
+    search = Search([prepare_segment(record, 0)], mapped, wind=False)
     assert search.parameters(search.x, 0).throttle_curve == pytest.approx(0.6)
 
 

@@ -16,10 +16,10 @@ from quadsim.features.identify.estimate import Identification, ParameterEstimate
 from quadsim.features.identify.fit import identify_records
 from quadsim.features.identify.intervals import MAX_AUTOCORRELATION
 from quadsim.features.identify.judgement import JudgedFit
-from quadsim.features.identify.model import stretch
+from quadsim.features.identify.model import prepare_segment
 from quadsim.features.identify.prediction import predict
 from quadsim.features.identify.record import Record, to_record
-from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.rotors import lagged_rotors
 from quadsim.features.identify.search import Search, _polynomial
 from quadsim.features.identify.series import Column
 from quadsim.features.identify.windows import to_world
@@ -136,7 +136,7 @@ def wrong(found: Identification, **others: float) -> list[str]:
 
 def test_rotors_lag_as_the_plant_s_do() -> None:
     log = flown().log
-    rotors = lagging(log.control.speeds, 0.01, rise=0.03, fall=0.04, delay=0.0)
+    rotors = lagged_rotors(log.control.speeds, 0.01, rise=0.03, fall=0.04, delay=0.0)
     stride = (len(log.plant.t) - 1) // len(log.control.t)
     settled = slice(100, len(log.control.t))  # they begin at another speed
     assert rotors.speeds[settled] == pytest.approx(log.plant.speeds[::stride][settled], abs=1e-9)
@@ -151,9 +151,9 @@ def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
     commands = 450.0 + 50.0 * np.random.default_rng(0).standard_normal((60, 4))
     fine = np.repeat(commands, 10, axis=0)
     shifted = fine[np.clip(np.arange(len(fine)) - round(1000.0 * delay), 0, len(fine) - 1)]
-    late = lagging(commands, 0.01, rise=0.03, fall=0.04, delay=delay)
+    late = lagged_rotors(commands, 0.01, rise=0.03, fall=0.04, delay=delay)
     assert late.speeds[30:-5] == pytest.approx(
-        lagging(shifted, 0.001, rise=0.03, fall=0.04, delay=0.0).speeds[::10][30:-5], rel=1e-4
+        lagged_rotors(shifted, 0.001, rise=0.03, fall=0.04, delay=0.0).speeds[::10][30:-5], rel=1e-4
     )
 
 
@@ -214,12 +214,12 @@ def test_hover_refuses_yaw_and_drag_and_says_what_to_fly() -> None:
 def test_the_gate_judges_the_final_interval() -> None:
     """What a later search moves far is not identified."""
     record = record_of(flown())
-    search = Search([stretch(record, 0)], START, wind=False)
+    search = Search([prepare_segment(record, 0)], START, wind=False)
     search.run()
     judgement = JudgedFit(search, {})
     assert not judgement.estimates["inertia_x"].refused
     assert judgement.refuse_moved(search) == {}
-    moved = Search(search.parts, START, wind=False)
+    moved = Search(search.segments, START, wind=False)
     moved.adopt(search)
     moved.x[[number.name for number in search.free].index("inertia_x")] += 0.4
     held = judgement.refuse_moved(moved)
@@ -275,7 +275,7 @@ def test_a_lag_that_nothing_shows_takes_the_inertia_with_it() -> None:
 def test_measured_speeds_take_the_place_of_commands() -> None:
     record = record_of(flown())
     assert record.commands is not None
-    rotors = lagging(record.commands, 0.01, rise=0.03, fall=0.04, delay=0.0)
+    rotors = lagged_rotors(record.commands, 0.01, rise=0.03, fall=0.04, delay=0.0)
     speeds = rotors.speeds + np.random.default_rng(0).standard_normal(rotors.speeds.shape)
     alone = identify(replace(record, commands=None, speeds=speeds))
     assert not wrong(alone)
@@ -287,7 +287,7 @@ def test_throttle_and_speeds_give_the_rotors_answer_and_then_the_forces() -> Non
     record = record_of(flown())
     throttle, voltage = throttled(record)
     assert record.commands is not None
-    rotors = lagging(record.commands, 0.01, rise=0.03, fall=0.04, delay=0.0)
+    rotors = lagged_rotors(record.commands, 0.01, rise=0.03, fall=0.04, delay=0.0)
     found = identify(replace(record, commands=None, throttle=throttle, voltage=voltage, speeds=rotors.speeds))
     assert not wrong(found, throttle_curve=0.7, voltage_exponent=2.0)
     known = by_name(found)

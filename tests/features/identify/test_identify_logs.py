@@ -17,9 +17,9 @@ from scipy.ndimage import uniform_filter1d
 import quadsim
 from quadsim.commands.cli import main
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError
-from quadsim.features.identify.checks import check_log, spans
+from quadsim.features.identify.checks import airborne_spans, check_log
 from quadsim.features.identify.record import Record, read_record
-from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.rotors import lagged_rotors
 from quadsim.features.identify.ulog import stated_rotors
 from quadsim.features.identify.windows import to_world
 from quadsim.flight.parquet import write_log
@@ -68,7 +68,7 @@ def hummingbird() -> Vehicle:
 
 
 def notes(record: Record, vehicle: Vehicle) -> tuple[str, ...]:
-    return check_log(record, vehicle, spans(record, vehicle))
+    return check_log(record, vehicle, airborne_spans(record, vehicle))
 
 
 def columns(record: Record, **others: Array) -> dict[str, Array]:
@@ -156,18 +156,20 @@ def test_gaps(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     np.testing.assert_allclose(read.t, eight.t, atol=1e-9)
     np.testing.assert_array_equal(read.commands[99:103], np.repeat(eight.commands[99:100], 4, axis=0))  # type: ignore[index]
     assert np.isnan(read.rates[300:330]).all()
-    parts = spans(read, hummingbird)
+    parts = airborne_spans(read, hummingbird)
     assert parts == [slice(0, 300), slice(330, 800)]
     (note,) = check_log(read, hummingbird, parts)
     assert note == "d.csv: 3.7 % of its samples, left out, are in gaps, the first at t = 3 s"
     with pytest.raises(InputError, match=r"3\.. s"):
-        spans(read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650])), hummingbird)
+        airborne_spans(
+            read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650])), hummingbird
+        )
 
 
 def test_log_without_a_whole_row(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     nothing = np.full(800, np.nan)
     with pytest.raises(InputError, match="0 % "):
-        spans(read_record(write_csv(tmp_path / "n.csv", columns(eight, vx=nothing))), hummingbird)
+        airborne_spans(read_record(write_csv(tmp_path / "n.csv", columns(eight, vx=nothing))), hummingbird)
     with pytest.raises(InputError, match="rotor"):
         read_record(write_csv(tmp_path / "n.csv", columns(eight, u4=nothing)))
 
@@ -176,7 +178,7 @@ def test_erpm(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     """ERPM / (poles / 2) = rpm; 65535 is a gap; poles are asked for, and a wrong count is named."""
     table = columns(eight)
     assert eight.commands is not None
-    speeds = lagging(eight.commands, eight.period, rise=0.0125, fall=0.025, delay=0.0).speeds
+    speeds = lagged_rotors(eight.commands, eight.period, rise=0.0125, fall=0.025, delay=0.0).speeds
     erpm = {f"erpm{i}": 7.0 * speeds[:, i - 1] * 60.0 / (2.0 * np.pi) for i in range(1, 5)}
     erpm["erpm2"][50] = 65535
     path = write_csv(tmp_path / "f.csv", {**table, **erpm}, without="u1 u2 u3 u4")
@@ -387,7 +389,7 @@ def test_good_log_passes(eight: Record, hummingbird: Vehicle, factor: float) -> 
     """In silence, from a start that is far off, too."""
     inertia = tuple(factor * moment for moment in hummingbird.inertia)
     start = replace(hummingbird, thrust_coefficient=factor * hummingbird.thrust_coefficient, inertia=inertia)
-    assert spans(eight, start) == [slice(0, 800)]
+    assert airborne_spans(eight, start) == [slice(0, 800)]
     assert notes(eight, start) == ()
 
 
@@ -436,7 +438,7 @@ def test_ground_is_cut(tmp_path: Path) -> None:
     """Rotors that spin up, take-off, and landing."""
     write_log(tmp_path, quadsim.fly("take-off-and-landing").log, plant_stride=5, metadata={})
     record = read_record(tmp_path)
-    (part,) = spans(record, quadsim.load_vehicle("lopes2011"))
+    (part,) = airborne_spans(record, quadsim.load_vehicle("lopes2011"))
     assert record.position is not None
     aloft = record.t[record.position[:, 2] > 0.02]
     assert aloft[0] <= record.t[part.start] < aloft[0] + 0.5
@@ -580,11 +582,11 @@ def test_ulog_knows_when_it_flies(tmp_path: Path, eight: Record, hummingbird: Ve
     topics["actuator_armed"] = ("bool armed;", np.array([0.0, 0.5, 7.8]), np.array([[False], [True], [False]]))
     topics["vehicle_land_detected"] = ("bool landed;", np.array([0.0, 1.0]), np.array([[True], [False]]))
     record = read_record(ulog(tmp_path / "armed.ulg", topics))
-    (part,) = spans(record, hummingbird)
+    (part,) = airborne_spans(record, hummingbird)
     np.testing.assert_allclose(record.t[[part.start, part.stop - 1]], [1.0, 7.8], atol=0.011)
     topics["actuator_armed"] = ("bool armed;", np.zeros(1), np.array([[False]]))
     with pytest.raises(InputError, match=r"parked\.ulg"):
-        spans(read_record(ulog(tmp_path / "parked.ulg", topics)), hummingbird)
+        airborne_spans(read_record(ulog(tmp_path / "parked.ulg", topics)), hummingbird)
 
 
 def test_accelerometer_fills_in_a_slow_velocity(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
@@ -616,7 +618,7 @@ def test_advice_names_the_setting_of_the_autopilot(tmp_path: Path, eight: Record
     for rarely in ((t, np.repeat(throttle[::10], 10, axis=0)), (t[::10], throttle[::10])):
         topics["actuator_motors"] = (fields, *rarely)
         with pytest.raises(InputError, match=r"outputs change (9|10)\b.* log the outputs .*set SDLOG_PROFILE to 17"):
-            spans(read_record(ulog(tmp_path / "default.ulg", topics)), hummingbird)
+            airborne_spans(read_record(ulog(tmp_path / "default.ulg", topics)), hummingbird)
 
 
 def test_rotors_that_a_ulog_states_are_offered_for_the_start(

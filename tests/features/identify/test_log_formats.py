@@ -16,12 +16,12 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.commands.cli import main
 from quadsim.errors import FileError, InputError
-from quadsim.features.identify.checks import check_log, spans
-from quadsim.features.identify.model import stretch
+from quadsim.features.identify.checks import airborne_spans, check_log
+from quadsim.features.identify.model import prepare_segment
 from quadsim.features.identify.quantities import NamedQuantity, read_map
 from quadsim.features.identify.record import Record, read_record, to_record
 from quadsim.features.identify.rotor_response import rotor_response
-from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.rotors import lagged_rotors
 from quadsim.features.identify.series import Column
 from quadsim.features.identify.windows import to_world
 from quadsim.rotation import conjugate, quaternion_to_euler
@@ -57,7 +57,7 @@ def check_flight(read: Record, eight: Record, *, exact: float, shift: float = 0.
     driving = read.throttle if read.throttle is not None else np.asarray(read.commands) / FULL
     np.testing.assert_allclose(driving[inner], sent, atol=exact)
     start = quadsim.load_vehicle("hummingbird")
-    check_log(read, start, spans(read, start))
+    check_log(read, start, airborne_spans(read, start))
 
 
 # ArduPilot
@@ -397,7 +397,7 @@ def blackbox(path: Path, columns: dict[str, Array], **headers: object) -> Path:
 def turning_speeds(record: Record) -> Array:
     """Rotors of the Hummingbird behind the record's commands [rad/s]."""
     assert record.commands is not None
-    return lagging(record.commands, record.period, rise=0.0125, fall=0.025, delay=0.0).speeds
+    return lagged_rotors(record.commands, record.period, rise=0.0125, fall=0.025, delay=0.0).speeds
 
 
 def betaflight(record: Record) -> dict[str, Array]:
@@ -564,11 +564,11 @@ def test_crazyflie_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
 
 def test_a_voltage_that_stands_still_shows_nothing(eight: Record) -> None:
     vehicle = quadsim.load_vehicle("hummingbird")
-    turning = lagging(np.asarray(eight.commands), eight.period, rise=0.02, fall=0.03, delay=0.0)
+    turning = lagged_rotors(np.asarray(eight.commands), eight.period, rise=0.02, fall=0.03, delay=0.0)
     flown = replace(eight, speeds=turning.speeds, throttle=throttle(eight), commands=None)
     names = {}
     for what, voltage in {"still": np.full(len(eight.t), 11.1), "sags": np.linspace(12.0, 11.0, len(eight.t))}.items():
-        response = rotor_response([stretch(replace(flown, voltage=voltage), 0)], vehicle, 11.1)
+        response = rotor_response([prepare_segment(replace(flown, voltage=voltage), 0)], vehicle, 11.1)
         names[what] = {*response}
         assert response["rotor_rise"].value == pytest.approx(0.02, abs=3e-3)
     assert names["sags"] - names["still"] == {"voltage_exponent"}

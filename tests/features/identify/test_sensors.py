@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
-from quadsim.features.identify.checks import LOG_CHECKS, ROW_CHECKS, check_log, spans
+from quadsim.features.identify.checks import LOG_CHECKS, ROW_CHECKS, airborne_spans, check_log
 from quadsim.features.identify.fit import identify_records
 from quadsim.features.identify.intervals import deviation_between
 from quadsim.features.identify.record import Record, read_record, to_record
-from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.rotors import lagged_rotors
 from quadsim.features.identify.sensors import without_spikes
 from quadsim.features.identify.series import Column
 from quadsim.state import Array
@@ -35,7 +35,7 @@ def eight(tmp_path_factory: pytest.TempPathFactory) -> Record:
         write_log(fly_eight(vehicle_path("hummingbird")), tmp_path_factory.mktemp("log") / "eight.csv")
     )
     assert record.commands is not None
-    speeds = lagging(record.commands, record.period, rise=RISE, fall=FALL, delay=0.0).speeds
+    speeds = lagged_rotors(record.commands, record.period, rise=RISE, fall=FALL, delay=0.0).speeds
     noise = np.random.default_rng(0).standard_normal(speeds.shape)
     return replace(record, speeds=speeds + noise)
 
@@ -50,7 +50,7 @@ def read(record: Record, **others: Array) -> Record:
 
 
 def notes(record: Record) -> tuple[str, ...]:
-    return check_log(record, VEHICLE, spans(record, VEHICLE))
+    return check_log(record, VEHICLE, airborne_spans(record, VEHICLE))
 
 
 def put(record: Record, field: str, row: int | slice, column: int, value: float) -> Array:
@@ -84,7 +84,7 @@ def test_a_sample_that_jumps_is_cut_and_named(
     (note,) = spoilt.notes
     assert note.startswith(f"log: {sensor}")
     assert f"at t = {eight.t[500]:.6g} s" in note
-    assert spans(spoilt, VEHICLE) == spans(read(eight), VEHICLE)
+    assert airborne_spans(spoilt, VEHICLE) == airborne_spans(read(eight), VEHICLE)
     kept = np.arange(len(eight.t)) != 500
     np.testing.assert_array_equal(getattr(spoilt, field)[kept], getattr(read(eight), field)[kept])
     before, after = getattr(eight, field)[[499, 501]]
@@ -190,7 +190,7 @@ def test_intervals_hold_the_truth_without_the_rows_that_a_radio_held(eight: Reco
     assert record.fresh is not None
     assert np.count_nonzero(~record.fresh) == pytest.approx(np.count_nonzero(held), abs=2)
     assert re.search(r"log: \d+% of its rows repeat rates and attitude .*: left out", record.notes[0])
-    found = identify_records([record], [spans(record, VEHICLE)], VEHICLE, wind=False)
+    found = identify_records([record], [airborne_spans(record, VEHICLE)], VEHICLE, wind=False)
     true = {f"inertia_{axis}": value for axis, value in zip("xyz", VEHICLE.inertia, strict=True)}
     true |= {name: getattr(VEHICLE, name) for name in ("thrust_coefficient", "drag_to_thrust", "rotor_inertia")}
     true |= {"rotor_rise": RISE, "rotor_fall": FALL}
@@ -205,7 +205,7 @@ def test_intervals_hold_the_truth_without_the_rows_that_a_radio_held(eight: Reco
 def test_noise_of_measured_speeds_does_not_bias_the_inertia_where_commands_are_logged(eight: Record) -> None:
     assert eight.speeds is not None
     loud = eight.speeds + 15.0 * np.random.default_rng(2).standard_normal(eight.speeds.shape)
-    parts = [spans(eight, VEHICLE)]
+    parts = [airborne_spans(eight, VEHICLE)]
     errors = {}
     for name, record in {
         "alone": replace(eight, speeds=loud, commands=None),
@@ -224,7 +224,7 @@ def test_flights_that_contradict_each_other_widen_the_interval(eight: Record) ->
     fast = replace(eight, commands=None)
     other = replace(fast, name="other", rates=1.1 * eight.rates)
     again = replace(fast, name="again", rates=eight.rates + 1e-9)
-    parts = [spans(eight, VEHICLE)] * 2
+    parts = [airborne_spans(eight, VEHICLE)] * 2
     widths = []
     for second in (again, other):
         found = identify_records([fast, second], parts, VEHICLE)

@@ -1,6 +1,6 @@
 """The errors of logs: what libraries, files and their values raise, as quadsim's own; and what a log states of itself.
 
-`reading` is about each reader of a format, `judging` about checks, fit and prediction.
+`reading_errors` is about each reader of a format, `fitting_errors` about checks, fit and prediction.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LARGEST_STATED: Final = 1e9  # of a number that a log states of itself
 
 
 @contextmanager
-def reading(path: Path, what: str, library: str = "") -> Iterator[None]:
+def reading_errors(path: Path, what: str, library: str = "") -> Iterator[None]:
     """Read a log, by a library that is imported within if it is named, and make a record of its values.
 
     Whatever is raised within, and is not ours, is a fault of the log.
@@ -40,7 +40,7 @@ def reading(path: Path, what: str, library: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def judging(names: str) -> Iterator[None]:
+def fitting_errors(names: str) -> Iterator[None]:
     """Check, fit and predict logs: what their numbers make fail is a fault of theirs.
 
     Raises:
@@ -87,7 +87,7 @@ def stated_number(
     return number
 
 
-def between(path: Path, what: str, low: ArrayLike, high: ArrayLike) -> dict[str, Any]:
+def scale_between(path: Path, what: str, low: ArrayLike, high: ArrayLike) -> dict[str, Any]:
     """Return zero and scale of outputs that a log has between two ends, one of each or one per rotor.
 
     Raises:
