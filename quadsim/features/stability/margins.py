@@ -253,7 +253,7 @@ def _measure_map_point(task: _PointTask) -> many.Row:
     return {"point": measure_point(task.loop, task.values)}
 
 
-def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> LoopMargins:
+def loop_margins(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> LoopMargins:
     """Return the margins of one loop, without any where it is not stable, measured in this process.
 
     Raises:
@@ -267,7 +267,7 @@ def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> L
     return LoopMargins(name=loop.name, size=loop.size, growth=growth, margins=_margins(loop, quantities, sides))
 
 
-class Measuring:
+class LoopMeasurement:
     """Measures loops in worker processes, and tells how far it is."""
 
     def __init__(self, loops: Sequence[MeasuredLoop], *, workers: int | None, progress: Progress) -> None:
