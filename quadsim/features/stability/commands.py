@@ -79,6 +79,7 @@ def stability(
     from contextlib import nullcontext
 
     from quadsim.console.progress import reporting
+    from quadsim.console.results import after
     from quadsim.features.stability.margins import LoopMeasurement, MeasuredLoop
     from quadsim.features.stability.quantities import quantities_named
     from quadsim.features.stability.report import Stability as Report
@@ -117,8 +118,6 @@ def stability(
     result = Report(scenario=stated.name, loops=tuple(measured), quantities=quantities, maps=tuple(maps))
     if out is None:
         return result
-    from quadsim.console.results import after
-
     with after(result, Path(out)):
         return result.write(Path(out), overwrite=overwrite)
 
