@@ -17,7 +17,7 @@ from timing import Record, options, run
 import quadsim
 from quadsim.console.progress import Progress
 from quadsim.errors import QuadsimError
-from quadsim.features.stability.margins import LoopMargins, MeasuredLoop, measured_here
+from quadsim.features.stability.margins import LoopMargins, MeasuredLoop, loop_margins
 from quadsim.features.stability.quantities import VARIED
 from quadsim.mpc.tables.bounded import Weighted
 from quadsim.rollout.growth import SIZE
@@ -52,7 +52,7 @@ def margins_of(case: tuple[str, str]) -> Record:
     started = clock.process_time()
     loop = MeasuredLoop(name=law, scenario=scenario, size=SIZE)
     try:
-        measured = measured_here(loop, [VARIED[name] for name in OVER])
+        measured = loop_margins(loop, [VARIED[name] for name in OVER])
     except QuadsimError as error:
         return {"law": law, "vehicle": vehicle, "growth [1/s]": str(error)}
     record: Record = {"law": law, "vehicle": vehicle, "growth [1/s]": f"{measured.growth.rate:.2f}"}

@@ -32,7 +32,7 @@ from quadsim.features.arguments import (
 from quadsim.scenarios.catalogue import campaign_names
 
 if TYPE_CHECKING:
-    from quadsim.features.campaign.campaign import CampaignResult, Replay
+    from quadsim.features.campaign.campaign import CampaignResult, Replay, Watch
     from quadsim.features.campaign.paired import PairedComparison
     from quadsim.features.campaign.plan import Plan
     from quadsim.features.campaign.sweep import Sweep
@@ -166,6 +166,7 @@ def campaign(
     from quadsim.features.campaign.events import parse_event
     from quadsim.features.campaign.plan import load_plan
     from quadsim.features.campaign.statistics import judge, parse_requirement
+    from quadsim.outputs import absolute
     from quadsim.scenarios.schema.scenario import Scenario
 
     if junit is not None and not require:
@@ -182,12 +183,23 @@ def campaign(
         plan = load_plan(str(campaign), list(changes), flights=flights, seed=seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     if out is None:
-        target = Path("runs") / "campaigns" / plan.spec.name
-    else:
-        target = Path(out)
-    with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
-        result = fly_campaign(plan, workers=workers, cluster=cluster, report=report, until_width=until_width, **options)
+        out = Path("runs") / "campaigns" / plan.spec.name
+    directory = absolute(out)
+    with _watched(directory, progress) as watch:
+        result = fly_campaign(
+            plan,
+            directory,
+            workers=workers,
+            cluster=cluster,
+            resume=resume,
+            overwrite=overwrite,
+            until_width=until_width,
+            report=report,
+            watch=watch,
+        )
     judgements = tuple(judge(result.table, requirement) for requirement in requirements)
     result = replace(result, judgements=judgements)
     if verdict_file is not None:
@@ -279,17 +291,13 @@ def replay(
 
 
 @contextmanager
-def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
-    """Yield the options of a command that adds flights to a directory; Ctrl-C says how to continue."""
+def _watched(directory: Path, progress: Watched) -> Iterator[Watch]:
+    """Yield the function that shows a campaign's progress; Ctrl-C says how to continue."""
     from quadsim.features.campaign.watching import watching
-    from quadsim.outputs import absolute
 
-    if resume and overwrite:
-        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
-    directory = absolute(target)
     try:
         with watching(bool(progress)) as watch:
-            yield {"directory": directory, "resume": resume, "overwrite": overwrite, "watch": watch}
+            yield watch
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{directory} has the flights so far, --resume continues it") from None
 

@@ -1,7 +1,8 @@
 """A campaign ready to fly: its file and scenario, which define the scenario and the row of each flight.
 
-A flight's scenario is the campaign's with the drawn values in its fields (`changed`); where an entry is relative, a
-drawn value multiplies the scenario's own.  `campaign_file` draws, `campaign` flies the plan, `rows` has the columns.
+A flight's scenario is the campaign's with the drawn values in its fields (`with_drawn_values`); where an entry is
+relative, a drawn value multiplies the scenario's own.  `campaign_file` draws, `campaign` flies the plan, `rows` has the
+columns.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ class Plan:
         """The columns that identify a flight."""
         row: Row = {"flight": flight, "seed": self.draws.seed(flight)}
         for name, value in self.draws.values(flight).items():
-            row[DRAW + name] = cell(value)
+            row[DRAW + name] = table_value(value)
         return row
 
     def check(self) -> None:
@@ -216,8 +217,8 @@ class Plan:
             if not {*_VEHICLE_FIELDS}.isdisjoint(entry.fields):
                 vehicles.append((entry, value))
         if vehicles:
-            scenario = Assembly(changed(scenario, vehicles, {}, table=self._table)).recorded.scenario
-        return changed(scenario, changes, {"name": name, "seed": seed}, table=self._table)
+            scenario = Assembly(with_drawn_values(scenario, vehicles, {}, table=self._table)).recorded.scenario
+        return with_drawn_values(scenario, changes, {"name": name, "seed": seed}, table=self._table)
 
 
 def read_campaign(name: str) -> dict[str, Any]:
@@ -228,8 +229,8 @@ def read_campaign(name: str) -> dict[str, Any]:
     """
     try:
         path = campaign_path(name)
-        data = read_merged((path, {}), lambda base: (campaign_path(base), {}), locate)
-        locate(data, path.parent)
+        data = read_merged((path, {}), lambda base: (campaign_path(base), {}), resolve_paths)
+        resolve_paths(data, path.parent)
         return data
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
@@ -244,7 +245,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
     if seed is not None:
         data["seed"] = seed
     spec = parse_campaign(data, source=path.name)
-    plan = Plan(spec, flown_scenario(spec, path, settings))
+    plan = Plan(spec, campaign_scenario(spec, path, settings))
     plan.check()
     return plan
 
@@ -262,7 +263,7 @@ def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignFile:
     return parse_table(CampaignFile, data, source, file="campaign")
 
 
-def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ()) -> Scenario:
+def campaign_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ()) -> Scenario:
     """The scenario of a campaign's file, with its changes and then those of the command line."""
     data = merge(read_scenario(spec.scenario), spec.set)
     file, _ = scenario_source(spec.scenario)
@@ -315,7 +316,7 @@ def _replaced_fields(plan: Plan) -> set[str]:
     return fields
 
 
-def locate(data: dict[str, Any], directory: Path) -> None:
+def resolve_paths(data: dict[str, Any], directory: Path) -> None:
     """Make the paths in a campaign's tables independent of its folder, in place."""
     for name in ("scenario", "base"):
         file = data.get(name)
@@ -336,7 +337,7 @@ def column_type(entry: Varied) -> pa.DataType:
     return pa.string()
 
 
-def cell(value: Value) -> Value | str:
+def table_value(value: Value) -> Value | str:
     """Return a drawn value as in the results: whole numbers as numbers, lists and tables as texts."""
     if isinstance(value, bool | str):
         return value
@@ -345,7 +346,9 @@ def cell(value: Value) -> Value | str:
     return str(value)
 
 
-def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mapping[str, Any], *, table: str) -> Scenario:
+def with_drawn_values(
+    scenario: Scenario, changes: Sequence[DrawnChange], identity: Mapping[str, Any], *, table: str
+) -> Scenario:
     """A scenario with the fields of some entries replaced; `table` of the file has the entries.
 
     `identity` has its name and seed, which no description lists.
@@ -389,7 +392,7 @@ def _scaled(scenario: Scenario, tables: dict[str, Any], entry: Varied, field: st
     """
     modelled = get_field(tables, field)
     if modelled is None:  # refused with its own message where there is no such field
-        changed(scenario, [(replace(entry, relative=False), value)], {}, table=table)
+        with_drawn_values(scenario, [(replace(entry, relative=False), value)], {}, table=table)
     owner = f"{table}.{entry.name}"
     if not _is_number(modelled):
         raise ParameterError(owner, "relative", True, f"false where the scenario has no number at {field}")

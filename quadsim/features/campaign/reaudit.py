@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -40,7 +41,7 @@ def judged_by(
     for limit in limits:
         unknown = null(table, SATISFIED + limit.name)
         held = _within_tolerances(table, limit) & ~unknown
-        table = _with_column(table, SATISFIED + limit.name, pa.array(held.tolist(), mask=unknown))
+        table = _with_column(table, SATISFIED + limit.name, held, unknown=unknown)
         table = table.drop_columns([TIME_VIOLATED + limit.name])
         if limit.required:
             all_held &= held | unknown
@@ -51,10 +52,10 @@ def judged_by(
     audit_verdict = np.where(failed_by | ~all_held, "violated", np.where(all_reached, HARMLESS, INCOMPLETE))
     verdicts = np.where(by_audit, audit_verdict, verdict)
     violated = np.where(by_audit, verdicts == "violated", flags(table, "violated", absent=True))
-    table = _with_column(table, "verdict", pa.array(verdicts.tolist()))
-    table = _with_column(table, "violated", pa.array(violated.tolist()))
+    table = _with_column(table, "verdict", verdicts)
+    table = _with_column(table, "violated", violated)
     failed = np.any([event.column(table) for event in failure], axis=0)
-    return _with_column(table, "failed", pa.array(failed.tolist()))
+    return _with_column(table, "failed", failed)
 
 
 def _require_same_bounds(limits: Sequence[Limit], audited: Sequence[Limit]) -> None:
@@ -83,6 +84,10 @@ def _within_tolerances(table: pa.Table, limit: Limit) -> FlightFlags:
     return np.asarray(within, bool)
 
 
-def _with_column(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
-    """Return the table with other values in a column."""
-    return table.set_column(table.column_names.index(name), table.schema.field(name), values)
+def _with_column(
+    table: pa.Table, name: str, values: np.ndarray[Any, Any], *, unknown: FlightFlags | None = None
+) -> pa.Table:
+    """Return the table with other values (K,) in a column, null where they are unknown."""
+    field = table.schema.field(name)
+    column = pa.array(values.tolist(), field.type, mask=unknown)
+    return table.set_column(table.column_names.index(name), field, column)

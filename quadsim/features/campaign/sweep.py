@@ -20,7 +20,7 @@ from quadsim.console.progress import Progress, silent
 from quadsim.console.results import Result, Shown
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.features.campaign.campaign_file import CampaignFile, GridValues
-from quadsim.features.campaign.plan import Plan, cell
+from quadsim.features.campaign.plan import Plan, table_value
 from quadsim.features.campaign.rows import DRAW, is_number, make_table, numbers
 from quadsim.palette import COLOUR
 from quadsim.report.figure import Bound, Figure, Panel, Series
@@ -224,7 +224,7 @@ def _swept_columns(entries: Sequence[GridValues]) -> dict[str, pa.Array]:
             together[tuple(entry.fields)] = value
         row = {}
         for path, leaf in leaves(separate(together, source="sweep"), entries=True):
-            row[path] = cell(leaf)
+            row[path] = table_value(leaf)
             paths[path] = None
         rows.append(row)
     columns = {}

@@ -86,7 +86,7 @@ class LinearSearch:
     def __init__(self, controller: CController, capacity: int, changes: int) -> None:
         problem = controller.law.problem
         self._library = core_library()
-        self._shared = CoreProblem(problem)
+        self._shared = CoreProblem(problem)  # has the arrays that the struct points to
         self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
         self._struct.room = capacity or self._struct.room
         self._struct.changes = changes or self._struct.changes

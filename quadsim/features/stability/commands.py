@@ -83,7 +83,8 @@ def stability(
     from contextlib import nullcontext
 
     from quadsim.console.progress import reporting
-    from quadsim.features.stability.margins import MeasuredLoop, Measuring
+    from quadsim.console.results import after
+    from quadsim.features.stability.margins import LoopMeasurement, MeasuredLoop
     from quadsim.features.stability.quantities import quantities_named
     from quadsim.features.stability.report import Stability as Report
     from quadsim.outputs import reserving
@@ -111,18 +112,16 @@ def stability(
         nullcontext() if out is None else reserving(out, overwrite=overwrite),
         reporting(progress, "the stability check") as report,
     ):
-        measuring = Measuring(loops, workers=workers, progress=report)
-        measured = measuring.margins(quantities)
+        measurement = LoopMeasurement(loops, workers=workers, progress=report)
+        measured = measurement.margins(quantities)
         maps = []
         if pair is not None:
             for loop, margins in zip(loops, measured, strict=True):
                 if {*pair} <= {*margins.margins}:
-                    maps.append(measuring.map(loop, margins, pair))
+                    maps.append(measurement.map(loop, margins, pair))
     result = Report(scenario=stated.name, loops=tuple(measured), quantities=quantities, maps=tuple(maps))
     if out is None:
         return result
-    from quadsim.console.results import after
-
     with after(result, Path(out)):
         return result.write(Path(out), overwrite=overwrite)
 

@@ -80,7 +80,7 @@ class Margin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Closest:
+class ClosestLimit:
     """The margin that is the smallest, as a share of the nominal value or of the range; see `VariedQuantity`."""
 
     quantity: str
@@ -100,14 +100,14 @@ class LoopMargins:
     failures: tuple[str, ...] = ()  # searches that failed, with the reason
 
     @property
-    def closest(self) -> Closest | None:
+    def closest(self) -> ClosestLimit | None:
         """The smallest margin, the first of equal ones; None where nothing within its range makes the loop unstable."""
-        limits: list[Closest] = []
+        limits: list[ClosestLimit] = []
         for name, margin in self.margins.items():
             for side in margin.sides:
                 if side.state in ("unstable", "neutral"):
                     share = VARIED[name].distance(margin.nominal, side.stable)
-                    limits.append(Closest(quantity=name, value=side.stable, share=share))
+                    limits.append(ClosestLimit(quantity=name, value=side.stable, share=share))
         if not limits:
             return None
         shares = [limit.share for limit in limits]
@@ -139,8 +139,8 @@ class MeasuredLoop:
         return isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
 
 
-def look(loop: MeasuredLoop, values: Mapping[str, float]) -> LoopPoint:
-    """Return what the loop does with these values of some quantities."""
+def measure_point(loop: MeasuredLoop, values: Mapping[str, float]) -> LoopPoint:
+    """Measure the growth of a loop with these values of some quantities, where it can be flown with them."""
     assembly = Assembly(loop.scenario)
     heading, changes = point(assembly, values)
     try:
@@ -162,7 +162,7 @@ def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], floa
     """Search one side of a margin: outwards, then by bisection of the first interval at whose end it is not stable.
 
     Args:
-        at: looks at a value.
+        at: measures the loop at a value.
         value_at: the value at a share of the way from the nominal value to the end of the range.
         geometric: whether the value is a factor.
     """
@@ -211,7 +211,7 @@ def _is_wide(value_at: Callable[[float], float], inner: float, outer: float, *, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Search:
+class _SideTask:
     """A task of a worker: one side of a margin."""
 
     loop: MeasuredLoop
@@ -219,7 +219,7 @@ class _Search:
     upward: bool
 
 
-def _search(task: _Search) -> many.Row:
+def _search_side(task: _SideTask) -> many.Row:
     """Return the side of a margin, for a worker."""
     assembly = Assembly(task.loop.scenario)
     quantity = VARIED[task.quantity]
@@ -229,7 +229,7 @@ def _search(task: _Search) -> many.Row:
     value_at = partial(quantity.between, nominal, end, step=quantity.step(assembly))
 
     def at(value: float) -> LoopPoint:
-        return look(task.loop, {task.quantity: value})
+        return measure_point(task.loop, {task.quantity: value})
 
     return {"side": find_side(at, value_at, geometric=quantity.geometric)}
 
@@ -241,19 +241,19 @@ def _grow(loop: MeasuredLoop) -> many.Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Look:
+class _PointTask:
     """A task of a worker: one point of a map."""
 
     loop: MeasuredLoop
     values: Mapping[str, float]
 
 
-def _look(task: _Look) -> many.Row:
+def _measure_map_point(task: _PointTask) -> many.Row:
     """Return a point of a map, for a worker."""
-    return {"point": look(task.loop, task.values)}
+    return {"point": measure_point(task.loop, task.values)}
 
 
-def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> LoopMargins:
+def loop_margins(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> LoopMargins:
     """Return the margins of one loop, without any where it is not stable, measured in this process.
 
     Raises:
@@ -262,12 +262,12 @@ def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> L
     growth: Growth = _grow(loop)["growth"]
     sides = {}
     if growth.stable:
-        for task in _searches(loop, quantities):
-            sides[task.quantity, task.upward] = _search(task)["side"]
+        for task in _side_tasks(loop, quantities):
+            sides[task.quantity, task.upward] = _search_side(task)["side"]
     return LoopMargins(name=loop.name, size=loop.size, growth=growth, margins=_margins(loop, quantities, sides))
 
 
-class Measuring:
+class LoopMeasurement:
     """Measures loops in worker processes, and tells how far it is."""
 
     def __init__(self, loops: Sequence[MeasuredLoop], *, workers: int | None, progress: Progress) -> None:
@@ -308,13 +308,13 @@ class Measuring:
             InputError: a loop cannot be built.
         """
         growths = self.growths()
-        tasks: list[_Search] = []
+        tasks: list[_SideTask] = []
         for loop, growth in zip(self._loops, growths, strict=True):
             if growth.stable:
-                tasks += _searches(loop, quantities)
+                tasks += _side_tasks(loop, quantities)
         rows: list[many.Row] = []
         if tasks:
-            rows = self._rows("margins", tasks, _search)
+            rows = self._rows("margins", tasks, _search_side)
         measured: list[LoopMargins] = []
         for loop, growth in zip(self._loops, growths, strict=True):
             sides = {}
@@ -345,9 +345,9 @@ class Measuring:
         tasks = []
         for y in y_values:
             for x in x_values:
-                tasks.append(_Look(loop=loop, values={across: x, up: y}))
+                tasks.append(_PointTask(loop=loop, values={across: x, up: y}))
         points: list[LoopPoint] = []
-        for task, row in zip(tasks, self._rows("map", tasks, _look), strict=True):
+        for task, row in zip(tasks, self._rows("map", tasks, _measure_map_point), strict=True):
             if "point" in row:
                 points.append(row["point"])
             else:
@@ -357,16 +357,16 @@ class Measuring:
         )
 
 
-def _searches(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> Iterator[_Search]:
+def _side_tasks(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> Iterator[_SideTask]:
     """Yield the sides that lie within the range of each quantity."""
     assembly = Assembly(loop.scenario)
     for quantity in quantities:
         nominal = quantity.nominal(assembly)
         low, high = quantity.ends(nominal)
         if low < nominal:
-            yield _Search(loop=loop, quantity=quantity.name, upward=False)
+            yield _SideTask(loop=loop, quantity=quantity.name, upward=False)
         if high > nominal:
-            yield _Search(loop=loop, quantity=quantity.name, upward=True)
+            yield _SideTask(loop=loop, quantity=quantity.name, upward=True)
 
 
 def _margins(
