@@ -641,5 +641,5 @@ def _joined(predictions: Sequence[_Prediction]) -> np.ndarray[Any, np.dtype[np.f
     if not parts:
         return None
     shortest = min(part.shape[1] for part in parts)
-    joined = np.concatenate([part[:, :shortest] for part in parts])
-    return np.ascontiguousarray(joined, dtype=np.float32)
+    positions = [part[:, :shortest] for part in parts]
+    return np.ascontiguousarray(np.concatenate(positions), dtype=np.float32)

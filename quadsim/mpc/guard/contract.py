@@ -114,7 +114,7 @@ class Guard:
         raise TypeError("a fallback contract cannot be copied or pickled: make another")
 
     def reset(self, speeds: Array) -> Array:
-        """Restart after the command u(-1) (4,) [rad/s]; return it, or hover's if it is not usable, for the law."""
+        """Restart after the command u(-1) (4,) [rad/s]; return it, or hover's if it is not usable."""
         command = _numbers(speeds, (N_ROTORS,))
         self._library.quadsim_guard_reset(self._struct, command.ctypes.data)
         self._predicted: Array | None = None  # (N, 12) where the rest of the last plan leads, once it is asked for

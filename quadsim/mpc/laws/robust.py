@@ -67,7 +67,7 @@ TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend o
 class Robust(TargetTable, Bounded):
     """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""
 
-    type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
+    type: Annotated[Literal["robust"], doc("the controller, by its name in `quadsim list`")] = "robust"
     commands: Annotated[Literal["rotors", "rates", "attitude"], doc(COMMANDS)] = "rotors"
     inner_lag: Annotated[InnerLag | None, doc(INNER_LAG)] = None
     attitude_lag: Annotated[AttitudeLag | None, doc(ATTITUDE_LAG)] = None

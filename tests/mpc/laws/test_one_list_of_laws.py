@@ -65,7 +65,7 @@ class OneSpeed(FeedbackLaw):
 class OneSpeedTable(Baseline):
     """One speed."""
 
-    type: Annotated[Literal["one-speed"], doc("the control law, by its name in `quadsim list`")] = "one-speed"
+    type: Annotated[Literal["one-speed"], doc("the controller, by its name in `quadsim list`")] = "one-speed"
     share: Annotated[float, Gt(0.0), Le(2.0), doc("[-] of the hover speed")] = 1.0
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> OneSpeed:

@@ -203,7 +203,7 @@ class NonlinearMPC:
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
-        raise TypeError("a law in C cannot be copied or pickled: make another")
+        raise TypeError("a controller in C cannot be copied or pickled: make another")
 
     def _make_ramp(self) -> RampObserver | None:
         settings = self.settings

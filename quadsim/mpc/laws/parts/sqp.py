@@ -308,7 +308,7 @@ def _require_alike(name: str, lower: Array, upper: Array) -> None:
     """Reject bounds (N,) that differ from step to step, where the core has one number for all."""
     for side in (lower, upper):
         if (side != side[0]).any():
-            raise ParameterError("controller", name, side.tolist(), "the same at all steps of the nonlinear law")
+            raise ParameterError("controller", name, side.tolist(), "the same at all steps of the nonlinear MPC")
 
 
 def _bounds(rows: list[_StatedRow], horizon: int) -> Array:
