@@ -294,7 +294,7 @@ class Named(Protocol):
 
     @property
     def name(self) -> str:
-        """Short name of the law."""
+        """Short name of the controller."""
         ...
 
 

@@ -65,7 +65,7 @@ def digest_of(path: Path) -> str:
 def file_hashes(directory: Path) -> dict[str, str]:
     """SHA-256 of every regular file below a directory except its summary and lock, by relative path, sorted."""
     hashes = {}
-    for name, mode in sorted(_below(directory).items()):
+    for name, mode in sorted(_modes_below(directory).items()):
         if S_ISREG(mode) and name not in (SUMMARY_FILE, LOCK_FILE):
             hashes[name] = digest_of(directory / name)
     return hashes
@@ -86,7 +86,7 @@ def reserving(
     asked = target = absolute(path)
     made: list[Path] = []
     try:
-        with _errors(target):
+        with _system_errors_named(target):
             for parent in target.parents:
                 if not parent.exists():
                     made.append(parent)
@@ -130,7 +130,7 @@ def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
         work.chmod(S_IMODE(target.stat().st_mode))  # not before: it may allow nothing
         try:
             _require_replaceable(target, overwrite=overwrite)
-            _clear(target)
+            _remove_listed_files(target)
             work.rename(target)
         except OSError as error:
             kept = work.rename(work.with_suffix(".kept"))
@@ -150,7 +150,7 @@ def adding(directory: Path, **changes: Any) -> Iterator[Path]:
     with _beside(directory) as work:
         yield work
         hashes = file_hashes(work)
-        listed = _listed(directory) or set()
+        listed = _files_of_summary(directory) or set()
         for name in hashes:
             if os.path.lexists(directory / name) and name not in listed:
                 raise OutputError(directory / name, f"{SUMMARY_FILE} does not list it; move it away first")
@@ -193,7 +193,7 @@ def require_file(path: Path | str, *, overwrite: bool = False) -> Path:
         OutputError: it cannot be written, or exists and may not be overwritten.
     """
     path = absolute(path)
-    with _errors(path):
+    with _system_errors_named(path):
         if os.path.lexists(path) and not (overwrite and path.is_file()):
             if path.is_dir():
                 raise OutputError(path, "is a folder")
@@ -220,14 +220,14 @@ class Growing:
     def write(self, files: Mapping[str, bytes]) -> None:
         """Write or replace files by their relative paths, each atomically."""
         for name, content in files.items():
-            with _errors(self.path / name):
+            with _system_errors_named(self.path / name):
                 (self.path / name).parent.mkdir(exist_ok=True)
                 with writing_file(self.path / name, overwrite=True) as new:
                     new.write_bytes(content)
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove files, and folders that become empty."""
-        with _errors(self.path):
+        with _system_errors_named(self.path):
             for name in names:
                 (self.path / name).unlink(missing_ok=True)
         folders = {(self.path / name).parent for name in names}
@@ -268,19 +268,19 @@ def growing(path: Path | str, mark: str, *, overwrite: bool = False, first: Sequ
         place = reserving(directory, overwrite=overwrite, first=first)
     with place, _locked(directory, mark=True):
         odd = []
-        for name, mode in _below(directory).items():
+        for name, mode in _modes_below(directory).items():
             if not (S_ISREG(mode) or S_ISDIR(mode)):
                 odd.append(name)
         if odd:
-            raise OutputError(directory, f"{_few(odd)}: links are refused; move them away first")
+            raise OutputError(directory, f"{_first_names(odd)}: links are refused; move them away first")
         _clear_partial(directory)
         if not goes_on:
-            _clear(directory, keep=LOCK_FILE)
+            _remove_listed_files(directory, keep=LOCK_FILE)
         try:
             yield Growing(directory)
         finally:
             with contextlib.suppress(OSError):  # the directory may be gone
-                if list(_below(directory)) == [LOCK_FILE]:
+                if list(_modes_below(directory)) == [LOCK_FILE]:
                     (directory / LOCK_FILE).unlink()
 
 
@@ -295,9 +295,9 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
     with contextlib.suppress(FileNotFoundError):  # the current directory may be gone
         if target.samefile(Path.cwd()):
             raise OutputError(target, "it is the current directory; name one to be made")
-    with _errors(target):
-        there = _below(target)
-        listed = _listed(target)
+    with _system_errors_named(target):
+        there = _modes_below(target)
+        listed = _files_of_summary(target)
     if S_ISREG(there.get(LOCK_FILE, 0)):
         with _locked(target):
             content = (target / LOCK_FILE).read_bytes()[: len(_LOCK_MARK) + 1]
@@ -307,7 +307,9 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
         if content in (b"", _LOCK_MARK) and {*there} <= left and all(map(S_ISREG, there.values())):
             return
     if there and not overwrite:
-        raise OutputError(target, f"it is not empty ({_few([*there])}); choose another --out, or add --overwrite")
+        raise OutputError(
+            target, f"it is not empty ({_first_names([*there])}); choose another --out, or add --overwrite"
+        )
     if there and listed is None:
         raise OutputError(target, f"it has no {SUMMARY_FILE} that lists its files; choose another --out")
     files = {*(listed or ()), SUMMARY_FILE, LOCK_FILE}
@@ -321,14 +323,14 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
         if not (is_listed_file or is_listed_folder):
             others.append(name)
     if others:
-        raise OutputError(target, f"its {SUMMARY_FILE} does not list {_few(others)}; move that away first")
+        raise OutputError(target, f"its {SUMMARY_FILE} does not list {_first_names(others)}; move that away first")
 
 
-def _clear(target: Path, keep: str = "") -> None:
+def _remove_listed_files(target: Path, keep: str = "") -> None:
     """Unlink the listed files of a directory and its lock, remove its folders, and unlink its summary last."""
     _clear_partial(target)
-    files = {*(_listed(target) or ()), LOCK_FILE} - {keep}
-    for name, mode in reversed(_below(target).items()):
+    files = {*(_files_of_summary(target) or ()), LOCK_FILE} - {keep}
+    for name, mode in reversed(_modes_below(target).items()):
         if S_ISDIR(mode):
             (target / name).rmdir()
         elif name in files:
@@ -350,7 +352,7 @@ def _remove(partial: Path) -> None:
     shutil.rmtree(partial, ignore_errors=True)
 
 
-def _listed(directory: Path) -> set[str] | None:
+def _files_of_summary(directory: Path) -> set[str] | None:
     """Return the files that a directory's summary lists; None if it has no list."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         summary = json.loads((directory / SUMMARY_FILE).read_bytes())
@@ -360,7 +362,7 @@ def _listed(directory: Path) -> set[str] | None:
     return None
 
 
-def _below(directory: Path) -> dict[str, int]:
+def _modes_below(directory: Path) -> dict[str, int]:
     """Return the modes of everything below a directory by relative path, parents first; links are not followed.
 
     Half-written folders of killed processes are left out.
@@ -381,7 +383,7 @@ def _below(directory: Path) -> dict[str, int]:
     return modes
 
 
-def _few(names: Sequence[str]) -> str:
+def _first_names(names: Sequence[str]) -> str:
     listed = ", ".join(map(printable, names[:3]))
     if len(names) > 3:
         listed += f" and {len(names) - 3} more"
@@ -391,7 +393,7 @@ def _few(names: Sequence[str]) -> str:
 @contextlib.contextmanager
 def _beside(target: Path) -> Iterator[Path]:
     """A temporary folder beside a target; errors about its contents name them as if they were in the target."""
-    with _errors(target):
+    with _system_errors_named(target):
         work = Path(tempfile.mkdtemp(prefix=".quadsim-", suffix=".partial", dir=target.parent))
         try:
             yield work
@@ -406,7 +408,7 @@ def _beside(target: Path) -> Iterator[Path]:
 @contextlib.contextmanager
 def _locked(directory: Path, *, mark: bool = False) -> Iterator[None]:
     """Lock a directory for this process; `mark` says in the lock whose it is."""
-    with _errors(directory / LOCK_FILE):
+    with _system_errors_named(directory / LOCK_FILE):
         handle = os.open(directory / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
         try:
@@ -414,7 +416,7 @@ def _locked(directory: Path, *, mark: bool = False) -> Iterator[None]:
         except OSError as error:
             raise OutputError(directory, "another process is writing there") from error
         if mark and os.fstat(handle).st_size == 0:
-            with _errors(directory / LOCK_FILE):
+            with _system_errors_named(directory / LOCK_FILE):
                 os.write(handle, _LOCK_MARK)
         yield
     finally:
@@ -422,7 +424,7 @@ def _locked(directory: Path, *, mark: bool = False) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _errors(path: Path) -> Iterator[None]:
+def _system_errors_named(path: Path) -> Iterator[None]:
     """Raise the system's errors as output errors."""
     try:
         yield

@@ -290,11 +290,11 @@ def implausible(vehicle: Vehicle) -> list[str]:
         more = ""
         if len(off) > 1:
             more = f", and {len(off) - 1} more ratios are off"
-        return [f"vehicle: {explanation}; as it is, {_line(off[0], vehicle)}{more}"]
+        return [f"vehicle: {explanation}; as it is, {_ratio_line(off[0], vehicle)}{more}"]
     lines = []
     for ratio in off:
-        parameters = ", ".join(_stated(ratio.of, vehicle))
-        lines.append(f"vehicle: {_line(ratio, vehicle)}; check {parameters}")
+        parameters = ", ".join(_stated_names(ratio.of, vehicle))
+        lines.append(f"vehicle: {_ratio_line(ratio, vehicle)}; check {parameters}")
     return lines
 
 
@@ -303,7 +303,7 @@ def _ratios_off(vehicle: Vehicle) -> list[Ratio]:
     return [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
 
 
-def _stated(names: Sequence[str], vehicle: Vehicle) -> list[str]:
+def _stated_names(names: Sequence[str], vehicle: Vehicle) -> list[str]:
     """Return the parameters as the vehicle states them: arms by `rotor_positions`, thrust by a map."""
     (thrust,) = [name for name in THRUST if getattr(vehicle, name) is not None]
     stated = []
@@ -317,7 +317,7 @@ def _stated(names: Sequence[str], vehicle: Vehicle) -> list[str]:
     return stated
 
 
-def _line(ratio: Ratio, vehicle: Vehicle) -> str:
+def _ratio_line(ratio: Ratio, vehicle: Vehicle) -> str:
     return f"{ratio.text} is {ratio.value(vehicle):.3g}, usually {ratio.low:g} to {ratio.high:g}"
 
 
@@ -326,57 +326,57 @@ def _explanation(vehicle: Vehicle) -> str | None:
 
     Every ratio that was off and that the unit changes must then be usual.
     """
-    before = _misfit(vehicle)
+    before = _total_misfit(vehicle)
     best = None
     off = _ratios_off(vehicle)
     for name, unit, other in _converted(vehicle):
-        misfit = _misfit(other)
+        misfit = _total_misfit(other)
         changed = [ratio for ratio in off if ratio.value(other) != ratio.value(vehicle)]
         usual = all(ratio.is_usual(other) for ratio in changed)
         if usual and misfit < 0.2 * before and (best is None or misfit < best[0] - 1e-9):
-            given = _shown(getattr(vehicle, name))
-            fits = _shown(getattr(other, name))
+            given = _value_text(getattr(vehicle, name))
+            fits = _value_text(getattr(other, name))
             best = misfit, f"is {name} = {given} given in {unit}? {fits} {VEHICLE_UNITS[name]} would fit"
     if best is None:
         return None
     return best[1]
 
 
-def _misfit(vehicle: Vehicle) -> float:
+def _total_misfit(vehicle: Vehicle) -> float:
     return sum(ratio.misfit(vehicle) for ratio in RATIOS)
 
 
 def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
     """Yield the vehicle with one parameter, or all that depend on rotor speeds, taken to be in another unit."""
-    speeds = {name: _scaled(getattr(vehicle, name), _SPEEDS["rpm"]) for name in ("speed_min", "speed_max")}
+    speeds = {name: _in_other_unit(getattr(vehicle, name), _SPEEDS["rpm"]) for name in ("speed_min", "speed_max")}
     for name, unit in (("thrust_coefficient", "N/rpm^2"), ("thrust_of_speed", "N/rpm and N/rpm^2")):
         thrust = getattr(vehicle, name)
         if thrust is None:
             continue
         with contextlib.suppress(ParameterError):
-            together = {**speeds, name: _scaled(thrust, UNITS[name][unit])}
+            together = {**speeds, name: _in_other_unit(thrust, UNITS[name][unit])}
             yield "speed_max", f"rpm, and {name} in {unit}", replace(vehicle, **together)
     for name, units in UNITS.items():
         value: Any = getattr(vehicle, name)
         if value is None:
             continue
         for unit, factor in units.items():
-            changes: dict[str, Any] = {name: _scaled(value, factor)}
+            changes: dict[str, Any] = {name: _in_other_unit(value, factor)}
             try:
                 yield name, unit, replace(vehicle, **changes)
             except ParameterError:  # no vehicle at all
                 continue
 
 
-def _scaled(value: Any, factor: float | tuple[float, ...]) -> Any:
+def _in_other_unit(value: Any, factor: float | tuple[float, ...]) -> Any:
     if isinstance(factor, tuple):
-        return tuple(_scaled(entry, one) for entry, one in zip(value, factor, strict=True))
+        return tuple(_in_other_unit(entry, one) for entry, one in zip(value, factor, strict=True))
     if isinstance(value, tuple):
-        return tuple(_scaled(entry, factor) for entry in value)
+        return tuple(_in_other_unit(entry, factor) for entry in value)
     return factor * value
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, tuple):
-        return ", ".join(_shown(entry) for entry in value)
+        return ", ".join(_value_text(entry) for entry in value)
     return f"{value:.4g}"

@@ -157,7 +157,7 @@ class Vehicle:
             value = getattr(self, name)
             if value is None and name in OPTIONAL_PARAMETERS:
                 continue
-            object.__setattr__(self, name, _checked(name, value))
+            object.__setattr__(self, name, _checked_parameter(name, value))
         if min(self.rate_damping or (0.0,)) < 0.0:
             self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
         if (self.inflow or 0.0) < 0.0:
@@ -230,7 +230,7 @@ class Vehicle:
         effect = self._effect_of_thrusts(spins)
         if abs(np.linalg.det(effect)) < 1e-9:
             return "a layout that controls roll, pitch, yaw and thrust"
-        if _shares(effect).min() < LEAST_SHARE:
+        if _hover_shares(effect).min() < LEAST_SHARE:
             return "a layout in which every rotor lifts while the torques cancel, so that it can hover"
         return None
 
@@ -318,7 +318,7 @@ class Vehicle:
         effect = self._effect_of_thrusts(self.rotor_spins)
         if np.abs(effect[1:].sum(axis=1)).max() <= BALANCED:
             return read_only(np.full(N_ROTORS, 1.0 / N_ROTORS))
-        return read_only(_shares(effect))
+        return read_only(_hover_shares(effect))
 
     @property
     def hover_speeds(self) -> Array:
@@ -518,12 +518,12 @@ def span(speeds: Array) -> str:
     return f"{low} to {high}"
 
 
-def _shares(effect: Array) -> Array:
+def _hover_shares(effect: Array) -> Array:
     """(4,) thrusts that add up to 1 while their torques cancel."""
     return np.linalg.solve(effect, np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-def _checked(name: str, value: Any) -> Any:
+def _checked_parameter(name: str, value: Any) -> Any:
     """Return a parameter, its lists as tuples.
 
     Raises:
@@ -536,15 +536,15 @@ def _checked(name: str, value: Any) -> Any:
         _check_number(name, value, positive=name not in _ANY_SIGN)
         return value
     if name != "rotor_positions":
-        return _checked_numbers(name, _entries(name, value, length, f"a list of {length} numbers"))
+        return _checked_numbers(name, _tuple_of(name, value, length, f"a list of {length} numbers"))
     rule = f"a list of {length} lists of 3 numbers"
     positions = []
-    for position in _entries(name, value, length, rule):
-        positions.append(_checked_numbers(name, _entries(name, position, 3, rule)))
+    for position in _tuple_of(name, value, length, rule):
+        positions.append(_checked_numbers(name, _tuple_of(name, position, 3, rule)))
     return tuple(positions)
 
 
-def _entries(name: str, value: Any, length: int, rule: str) -> tuple[Any, ...]:
+def _tuple_of(name: str, value: Any, length: int, rule: str) -> tuple[Any, ...]:
     if not isinstance(value, (tuple, list)) or len(value) != length:
         raise ParameterError("vehicle", name, value, rule)
     return tuple(value)

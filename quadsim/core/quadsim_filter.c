@@ -172,7 +172,8 @@ static void predict_flight(const quadsim_filter *f, quadsim_track *t, double acc
     square A = {{0.0}}, F = {{0.0}};
     for (int i = 0; i < 3; i++) {
         A[P_ + i][V_ + i] = A[THETA + i][OMEGA + i] = h;
-        A[V_ + i][THETA] = h * (-a * R[i][1]), A[V_ + i][THETA + 1] = h * (a * R[i][0]);
+        A[V_ + i][THETA] = h * (-a * R[i][1]);
+        A[V_ + i][THETA + 1] = h * (a * R[i][0]);
         for (int j = 0; j < 3; j++) {
             A[THETA + i][THETA + j] = h * turning[i][j];
             A[OMEGA + i][OMEGA + j] = h * spinning[i][j];
@@ -181,7 +182,10 @@ static void predict_flight(const quadsim_filter *f, quadsim_track *t, double acc
     for (int i = 0; i < ERRORS; i++) {
         F[i][i] = 1.0;
     }
-    horner_step(A, F, 3.0), horner_step(A, F, 2.0), horner_step(A, F, 1.0); /* 1 + A (1 + A / 2 (1 + A / 3)) */
+    /* 1 + A (1 + A / 2 (1 + A / 3)), from the inside out */
+    horner_step(A, F, 3.0);
+    horner_step(A, F, 2.0);
+    horner_step(A, F, 1.0);
     propagate_covariance(F, t->P);
     for (int i = 0; i < ERRORS; i++) { /* white noise, through the two double integrators */
         t->P[i][i] += h * f->density[i / 3];
@@ -322,8 +326,12 @@ static void invert_symmetric(double S[3][3], double W[3][3])
 {
     const double a = S[0][0], b = S[0][1], c = S[0][2], d = S[1][1], e = S[1][2], f = S[2][2];
     const double A = d * f - e * e, B = c * e - b * f, C = b * e - c * d, scale = 1.0 / (a * A + b * B + c * C);
-    W[0][0] = scale * A, W[1][1] = scale * (a * f - c * c), W[2][2] = scale * (a * d - b * b);
-    W[0][1] = W[1][0] = scale * B, W[0][2] = W[2][0] = scale * C, W[1][2] = W[2][1] = scale * (b * c - a * e);
+    W[0][0] = scale * A;
+    W[1][1] = scale * (a * f - c * c);
+    W[2][2] = scale * (a * d - b * b);
+    W[0][1] = W[1][0] = scale * B;
+    W[0][2] = W[2][0] = scale * C;
+    W[1][2] = W[2][1] = scale * (b * c - a * e);
 }
 
 static void apply_error(double *mean, const double *error)

@@ -94,7 +94,8 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
     const double rest = fmax(open_circuit_voltage(v) - v->resistance * v->idle_current, 0.0);
     const double voltage = 2.0 * rest / (1.0 + sqrt(1.0 + 4.0 * v->resistance * conductance * rest));
     const double current = conductance * (voltage * voltage) + v->idle_current;
-    row[0] = voltage, row[1] = v->charge;
+    row[0] = voltage;
+    row[1] = v->charge;
     v->charge = fmax(v->charge - v->timestep / (3600.0 * v->capacity) * current, 0.0);
     return pow(voltage / v->reference_voltage, v->exponent);
 }
@@ -461,7 +462,8 @@ static int64_t answer_if_due(quadsim_vehicle *v, quadsim_inner *loop, quadsim_se
             double motion[MOTION];
             motion_of(v, motion);
             quadsim_hear(sensed, v->now, motion);
-            attitude = sensed->attitude, rates = sensed->rates;
+            attitude = sensed->attitude;
+            rates = sensed->rates;
         }
         quadsim_answer(loop, v->time, rates, v->speeds, attitude);
         loop->until = loop->stride;

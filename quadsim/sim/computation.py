@@ -22,7 +22,7 @@ from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.solvers import ALIASES, SUCCESSORS, find_solver, solver_entries
 
 _COUNT_THEMSELVES: Final = ("nonlinear", LAW)
-"""Laws that count iterations without a solver of `quadsim list`: the nonlinear one, and a controller of one's own."""
+"""Controllers that count iterations without a solver of `quadsim list`: the nonlinear MPC, and a user's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class ComputationTime:
         dict[str, ComputationSeconds],
         doc(
             "[s] for each iteration, by the solver that it was measured for: its name in `quadsim list`, nonlinear for "
-            "that law's own, law for a controller of yours; refused without a solver that may answer; absent: no time"
+            "that MPC's own, law for a controller of yours; refused without a solver that may answer; absent: no time"
         ),
     ] = field(default_factory=dict)
     plan: Annotated[

@@ -144,7 +144,7 @@ class ClosedLoop:
         """
         plant.reset(initial_state, initial_speeds)
         controller.reset(initial_speeds)
-        _begin(controller, plant)
+        _tell_attitude(controller, plant)
         self.k = 0
         self.period = steps_per_period * plant.timestep
         self.controller = controller
@@ -227,7 +227,7 @@ class ClosedLoop:
             raise InputError("a controller takes over before a period is observed, not after")
         with _ending_flight(self.time):
             controller.reset(self._speeds.copy())
-            _begin(controller, self._plant)
+            _tell_attitude(controller, self._plant)
             if isinstance(controller, Adopting):
                 controller.adopt(self.controller)
         if self.k > self._switched:
@@ -319,8 +319,8 @@ class ClosedLoop:
             predictions.append(self._predict())
         return replace(
             log,
-            predicted=_joined(predictions),
-            foreseen=_foreseen(predictions),
+            predicted=_joined_positions(predictions),
+            foreseen=_joined_next_states(predictions),
             reason=self.reason,
             interrupted=self._interrupted,
             traceback=self._traceback,
@@ -600,7 +600,7 @@ def uncollected() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _begin(controller: Controller, plant: Plant) -> None:
+def _tell_attitude(controller: Controller, plant: Plant) -> None:
     """Tell a controller that wants to know how the vehicle turns now."""
     if isinstance(controller, Beginning):
         controller.begin(plant.attitude[1])
@@ -619,7 +619,7 @@ class _Prediction(NamedTuple):
     next_states: Array | None  # (K, 12) for the period after each
 
 
-def _foreseen(predictions: Sequence[_Prediction]) -> Array | None:
+def _joined_next_states(predictions: Sequence[_Prediction]) -> Array | None:
     """The states (K, 12) that each controller predicted for the next period, NaN of those that did not."""
     if all(prediction.next_states is None for prediction in predictions):
         return None
@@ -632,7 +632,7 @@ def _foreseen(predictions: Sequence[_Prediction]) -> Array | None:
     return np.concatenate(parts)
 
 
-def _joined(predictions: Sequence[_Prediction]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+def _joined_positions(predictions: Sequence[_Prediction]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
     """The positions that each controller predicted, as far ahead as all of them did; None where one did not."""
     parts = []
     for prediction in predictions:
@@ -642,5 +642,5 @@ def _joined(predictions: Sequence[_Prediction]) -> np.ndarray[Any, np.dtype[np.f
     if not parts:
         return None
     shortest = min(part.shape[1] for part in parts)
-    joined = np.concatenate([part[:, :shortest] for part in parts])
-    return np.ascontiguousarray(joined, dtype=np.float32)
+    positions = [part[:, :shortest] for part in parts]
+    return np.ascontiguousarray(np.concatenate(positions), dtype=np.float32)

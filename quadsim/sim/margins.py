@@ -178,14 +178,14 @@ def _translate(limit: Limit, bound: Any) -> bool:
                 bound.factor[k] = factor
             else:
                 bound.index[k] = INDEX[term]
-                bound.factor[k] = factor * _scale(INDEX[term])
+                bound.factor[k] = factor * _unit_factor(INDEX[term])
             bound.terms = k + 1
         bound.signal = constant("SIGNAL_SUM")
     elif name in INDEX:
         bound.signal = constant("SIGNAL_SUM")
         bound.terms = 1
         bound.index[0] = INDEX[name]
-        bound.factor[0] = _scale(INDEX[name])
+        bound.factor[0] = _unit_factor(INDEX[name])
     elif name in ("tilt", "thrust", "speed", "slew"):
         bound.signal = constant(f"SIGNAL_{name.upper()}")
         if name == "tilt":
@@ -198,17 +198,17 @@ def _translate(limit: Limit, bound: Any) -> bool:
         state = INDEX[name.removesuffix("_estimate_error")]
         bound.signal = constant("SIGNAL_ESTIMATE")
         bound.axis = state
-        bound.factor[0] = _scale(state)
+        bound.factor[0] = _unit_factor(state)
     elif name.endswith("_error"):
         tracked = name.removesuffix("_error")
         bound.signal = constant("SIGNAL_ERROR")
         bound.axis = REFERENCE_NAMES.index(tracked)
-        bound.factor[0] = _scale(INDEX[tracked])
+        bound.factor[0] = _unit_factor(INDEX[tracked])
     else:
         return False
     return True
 
 
-def _scale(state: int) -> float:
+def _unit_factor(state: int) -> float:
     """Return the factor from a state's SI unit to that of its limits."""
     return shown_unit(STATE_UNITS[state])[1]

@@ -550,15 +550,19 @@ class Plant:
             drawn["disturbance"][rows] += self._lasting.advance(steps)
         if self._moving:
             times = self.timestep * np.arange(self._step, self._step + steps, dtype=np.float64)
-            positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)
-            drawn["obstacles"][rows] = positions.reshape(steps, -1)
+            positions = [obstacle.positions(times) for obstacle in self._moving]
+            drawn["obstacles"][rows] = np.stack(positions, axis=1).reshape(steps, -1)
 
     def allows(self, changes: Sequence[Change]) -> bool:
         """Return whether it was built for changes of these kinds."""
-        weighing = not self._reweighed and any(isinstance(change, LOADING) for change in changes)
-        carrying = self._integrator == "rk4" and any(isinstance(change, _CARRYING) for change in changes)
-        pushing = not self._follows_motion and any(isinstance(change, PushChange) for change in changes)
-        return not (weighing or carrying or pushing)
+        for change in changes:
+            if isinstance(change, LOADING) and not self._reweighed:
+                return False
+            if isinstance(change, _CARRYING) and self._integrator == "rk4":
+                return False
+            if isinstance(change, PushChange) and not self._follows_motion:
+                return False
+        return True
 
     def reschedule(self, changes: Sequence[Change]) -> None:
         """Schedule these changes, of kinds that it `allows`; past ones are ignored."""

@@ -25,11 +25,11 @@ from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.vehicle import N_ROTORS
 
 SHARED_FILES: Final = ("quadsim_core.h", "quadsim_math.h", "quadsim_guard.h", "quadsim_guard.c")
-"""Files of `quadsim/mpc/c` that every law takes."""
+"""Files of `quadsim/mpc/c` that every controller takes."""
 CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
-"""Those of the linear laws."""
+"""Those of the linear controllers."""
 BODY_FILES: Final = ("quadsim_rigid.h",)
-"""Files of `quadsim/core` to export verbatim, for every law."""
+"""Files of `quadsim/core` to export verbatim, for every controller."""
 DATA_FILE: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500

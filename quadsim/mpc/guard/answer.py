@@ -211,7 +211,7 @@ class AnswerCheck:
         of_plan = of_inputs @ inputs + of_state @ (states - x_s)[..., None]
         of_plan = of_plan.reshape(*plans.shape[:-1], -1)
         values[..., at] += of_plan + (C @ x_s[..., None])[..., None, :, 0]
-        return _largest(rows, values, slacks)
+        return _largest_violation(rows, values, slacks)
 
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
         """See `violations`, of an answer; slower of another problem than this object's."""
@@ -229,10 +229,10 @@ class AnswerCheck:
                 before = np.concatenate((query.state[None], states[:-1]))
                 of_plan = np.where(rows.of_states, of_plan, (rows.C @ before[:, :, None])[:, :, 0])
             values += of_plan
-        return float(_largest(rows, values, answer.slacks))
+        return float(_largest_violation(rows, values, answer.slacks))
 
 
-def _largest(rows: Rows, values: Array, slacks: Array) -> Array:
+def _largest_violation(rows: Rows, values: Array, slacks: Array) -> Array:
     """Return (...,) the largest violation of rows by their values (..., N, m), less the slack of soft rows."""
     beyond = np.maximum(values - rows.upper, rows.lower - values)
     if np.count_nonzero(slacks):

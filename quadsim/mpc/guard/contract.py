@@ -114,8 +114,8 @@ class Guard:
         raise TypeError("a fallback contract cannot be copied or pickled: make another")
 
     def reset(self, speeds: Array) -> Array:
-        """Restart after the command u(-1) (4,) [rad/s]; return it, or hover's if it is not usable, for the law."""
-        command = _numbers(speeds, (N_ROTORS,))
+        """Restart after the command u(-1) (4,) [rad/s]; return it, or hover's if it is not usable."""
+        command = _numbers_for_the_core(speeds, (N_ROTORS,))
         self._library.quadsim_guard_reset(self._struct, command.ctypes.data)
         self._predicted: Array | None = None  # (N, 12) where the rest of the last plan leads, once it is asked for
         self._predicted_at = 0  # the age of the plan then
@@ -182,7 +182,7 @@ class Guard:
 
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the controller estimates; level hover if it estimates none."""
-        trim = _tried(lambda: self._trim_of(law))
+        trim = _result_or_failure(lambda: self._trim_of(law))
         if isinstance(trim, Trim):
             return trim
         return self._level
@@ -201,7 +201,7 @@ class Guard:
         """See `quadsim.controller.Predicting`; by the hover model where the controller cannot."""
         predicted = None
         if isinstance(law, Predicting):
-            predicted = _tried(lambda: law.predict(states, plans))
+            predicted = _result_or_failure(lambda: law.predict(states, plans))
         if isinstance(predicted, np.ndarray) and predicted.shape == (*plans.shape[:2], N_STATES):
             return predicted
         trim = self.trim(law)
@@ -226,9 +226,9 @@ class Guard:
 
     def _begin(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> int:
         """Complete the state; return the status for which the controller is not to be called, or `_CALLED`."""
-        self._measured[:] = _numbers(state, (N_STATES,))
-        path = _numbers(reference, (law.horizon, len(REFERENCE_STATES)))
-        self._acting[:] = _numbers(now.acting, (N_ROTORS,))
+        self._measured[:] = _numbers_for_the_core(state, (N_STATES,))
+        path = _numbers_for_the_core(reference, (law.horizon, len(REFERENCE_STATES)))
+        self._acting[:] = _numbers_for_the_core(now.acting, (N_ROTORS,))
         self._set_trim(law)
         measured, acting = self._inputs
         code: int = self._library.quadsim_guard_begin(
@@ -240,7 +240,7 @@ class Guard:
         """Return the controller's status and, if it gave one, its answer, of the right shape if it is accepted."""
         known = self._state.copy()
         completed = completed_inputs(now, self._in_force.copy(), self._unseen.astype(float), known)
-        answer: Command | Exception = _tried(lambda: law.step(completed, known.copy(), reference))
+        answer: Command | Exception = _result_or_failure(lambda: law.step(completed, known.copy(), reference))
         if isinstance(answer, Exception):  # e.g. `PlanExhaustedError` as `plan_exhausted_error`
             return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
         if answer.status in ACCEPTED:
@@ -298,7 +298,7 @@ def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array
     )
 
 
-def _numbers(value: Any, shape: tuple[int, ...]) -> Array:
+def _numbers_for_the_core(value: Any, shape: tuple[int, ...]) -> Array:
     """Return real numbers of a shape as the C takes them; of anything else as many that are none."""
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
         return np.ascontiguousarray(value)
@@ -315,7 +315,7 @@ def _plan_of(answer: Command) -> Array:
     return plan
 
 
-def _tried(call: Callable[[], Any]) -> Any:
+def _result_or_failure(call: Callable[[], Any]) -> Any:
     """Return the result of a call, or the exception of `FAILURES` that it raises."""
     try:
         return call()

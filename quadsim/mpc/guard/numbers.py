@@ -3,11 +3,7 @@
 Completion is by a Kalman filter on the hover model, whose process noise is an acceleration, constant over a period and
 white from one to the next (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
 2001, Sec.  6.3.2).
-
-Level hover is the LQR of the infinite horizon on the same model, in the heading frame, where the model at zero yaw
-holds for any yaw.  The weights follow Bryson's rule (Bryson and Ho, "Applied Optimal Control", 1975, Sec.  5.2), one
-over the square of the largest acceptable value, for states and for the *accelerations* that inputs cause, not for rotor
-speeds: the closed loop is then the same for every vehicle.
+Level hover is the LQR of the infinite horizon on the same model (`HoverGain`).
 """
 
 from __future__ import annotations
@@ -60,7 +56,13 @@ _ROLL_PITCH: Final = [1, 2]  # rows of an acceleration (4,)
 
 @dataclass(frozen=True, kw_only=True)
 class HoverGain:
-    """The LQR of hover: acceleration = -gain e, change of commands = inverse acceleration."""
+    """The LQR of hover: acceleration = -gain e, change of commands = inverse acceleration.
+
+    It holds in the heading frame, where the model at zero yaw holds for any yaw.  The weights follow Bryson's rule
+    (Bryson and Ho, "Applied Optimal Control", 1975, Sec.  5.2), one over the square of the largest acceptable value,
+    for states and for the *accelerations* that inputs cause, not for rotor speeds: the closed loop is then the same for
+    every vehicle.
+    """
 
     gain: Array  # (4, 12) K, for errors in the heading frame
     slope: Array  # (4, 4) S, from commands to accelerations along z and about x, y, z

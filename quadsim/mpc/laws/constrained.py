@@ -34,7 +34,7 @@ class Constrained(Bounded):
 
     holds_plans: ClassVar = True
 
-    type: Annotated[Literal["constrained"], doc("the control law, by its name in `quadsim list`")] = "constrained"
+    type: Annotated[Literal["constrained"], doc("the controller, by its name in `quadsim list`")] = "constrained"
     fallback: Annotated[
         FallbackSettings | None,
         doc("absent: the last plan is held, shifted, and then the flight ends"),

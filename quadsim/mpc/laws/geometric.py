@@ -229,7 +229,7 @@ class GeometricController(FeedbackLaw):
         self._library.quadsim_geometric_reset(self._law, self._before.ctypes.data)
 
     def adopt(self, previous: object) -> None:
-        """Take over the integrals and the observer of the previous law."""
+        """Take over the integrals and the observer of the previous controller."""
         if isinstance(previous, GeometricController):
             set_members(self._law, **vars(previous.integrals))
             if self._targets is previous._targets:
@@ -520,7 +520,7 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
 class Geometric(Tuned):
     """Geometric tracking on SE(3)."""
 
-    type: Annotated[Literal["geometric"], doc("the control law, by its name in `quadsim list`")] = "geometric"
+    type: Annotated[Literal["geometric"], doc("the controller, by its name in `quadsim list`")] = "geometric"
     integral: Annotated[bool, doc("whether position and attitude errors are integrated")] = False
     feedforward: Annotated[
         bool, doc("whether the reference's jerk and snap are fed forward, and drag, by differential flatness")

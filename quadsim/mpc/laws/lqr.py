@@ -223,7 +223,7 @@ class LQR(FeedbackLaw):
 class LQRTable(Baseline):
     """LQR over an infinite horizon on the hover model."""
 
-    type: Annotated[Literal["lqr"], doc("the control law, by its name in `quadsim list`")] = "lqr"
+    type: Annotated[Literal["lqr"], doc("the controller, by its name in `quadsim list`")] = "lqr"
     output_weights: Annotated[
         Annotated[dict[str, Weight], Len(1)] | None,
         doc(

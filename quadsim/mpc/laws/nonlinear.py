@@ -126,7 +126,7 @@ class Nonlinear(TargetTable):
 
     any_attitude: ClassVar = True
 
-    type: Annotated[Literal["nonlinear"], doc("the control law, by its name in `quadsim list`")] = "nonlinear"
+    type: Annotated[Literal["nonlinear"], doc("the controller, by its name in `quadsim list`")] = "nonlinear"
     horizon: Annotated[Horizon, doc("[periods] prediction horizon, a whole number of nodes")] = 20
     node: Annotated[Seconds | None, doc("[s] time between nodes, whole periods; absent: one period")] = None
     iterations: Annotated[

@@ -244,7 +244,7 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
 class PID(Tuned):
     """Cascaded PID as autopilots fly it."""
 
-    type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
+    type: Annotated[Literal["pid"], doc("the controller, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
     moment: Annotated[
         bool,

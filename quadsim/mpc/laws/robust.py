@@ -82,7 +82,7 @@ class Robust(TargetTable, Bounded):
         16
     """
 
-    type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
+    type: Annotated[Literal["robust"], doc("the controller, by its name in `quadsim list`")] = "robust"
     commands: Annotated[Literal["rotors", "rates", "attitude"], doc(COMMANDS)] = "rotors"
     inner_lag: Annotated[InnerLag | None, doc(INNER_LAG)] = None
     attitude_lag: Annotated[AttitudeLag | None, doc(ATTITUDE_LAG)] = None

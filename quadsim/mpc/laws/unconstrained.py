@@ -107,7 +107,7 @@ class UnconstrainedMPC:
 class Unconstrained(Weighted):
     """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
 
-    type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
+    type: Annotated[Literal["unconstrained"], doc("the controller, by its name in `quadsim list`")] = "unconstrained"
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> UnconstrainedMPC:
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""

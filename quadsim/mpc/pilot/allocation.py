@@ -1,14 +1,7 @@
 """Control allocation: thrust and torques to rotor speeds within bounds.  Yaw is sacrificed first.
 
 The wrench is linear in the squared speeds s = w^2: wrench = M s (Sec. 2.2).  A wrench that the bounds do not allow is
-approximated in two stages:
-
-1. thrust, roll and pitch torque exactly, yaw torque as closely as possible: the speeds that give the first three form
-   a line, and the yaw torque varies along it (the last stage of PX4's mixers);
-2. where no point of that line is within the bounds, weighted least squares of the error, with roll and pitch above
-   thrust above yaw, and thrust first clipped to its range (Smeur, Höppener, De Wagter, "Prioritized control allocation
-   for quadrotors subject to saturation", 2017, after Härkegård, "Efficient active set algorithms for solving
-   constrained least squares problems in aircraft control allocation", 2002).
+approximated (`allocate`).  The autopilot allocates in each of its steps, `quadsim/core/quadsim_inner.c`.
 """
 
 from __future__ import annotations
@@ -80,8 +73,17 @@ def allocation_struct(allocation: Allocation, lower: Array, upper: Array) -> Str
 def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) -> Array:
     """Return the rotor speeds (4,) within `lower` and `upper` (4,) [rad/s] whose wrench is closest to the one demanded.
 
-    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; the bounds are finite.  The core
-    computes it; stage 2 is the best of all choices of rotors at their lower or upper bound.
+    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; the bounds are finite.  One that
+    they do not allow is approximated in two stages:
+
+    1. thrust, roll and pitch torque exactly, yaw torque as closely as possible: the speeds that give the first three
+       form a line, and the yaw torque varies along it (the last stage of PX4's mixers);
+    2. where no point of that line is within the bounds, weighted least squares of the error, with roll and pitch above
+       thrust above yaw, and thrust first clipped to its range (Smeur, Höppener, De Wagter, "Prioritized control
+       allocation for quadrotors subject to saturation", 2017, after Härkegård, "Efficient active set algorithms for
+       solving constrained least squares problems in aircraft control allocation", 2002).
+
+    The core computes it; stage 2 is the best of all choices of rotors at their lower or upper bound.
     """
     demanded = np.ascontiguousarray(wrench, np.float64)
     speeds = np.empty(N_ROTORS)

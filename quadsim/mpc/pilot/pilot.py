@@ -46,7 +46,7 @@ class Pilot:
     commanded are the attitudes whose errors make the autopilot turn so.
 
     Attributes:
-        law: the law.
+        law: the controller.
         guard: the fallback contract; None for none.
         inner: the inner loop; None where the rotors hold each command.
         attitudes: what makes attitudes of the law's body rates; None where the law's commands are flown as they are.
@@ -99,7 +99,7 @@ class Pilot:
 
     @property
     def name(self) -> str:
-        """Short name of the law."""
+        """Short name of the controller."""
         return self.law.name
 
     @property
@@ -109,7 +109,7 @@ class Pilot:
 
     @property
     def horizon(self) -> int:
-        """N of the law."""
+        """N of the controller."""
         return self.law.horizon
 
     @property

@@ -2,9 +2,7 @@
 
 The thrust axis is b = (a + g e_z) / |a + g e_z| (Mellinger and Kumar 2011, Sec. III). The heading about it is either
 free, so that the rate about body z is zero, or held, so that body x is as close as possible to the direction of a given
-yaw, and body y is perpendicular to that direction. The free heading of a course that turns the vehicle upside down is
-propagated from sample to sample by the least rotation from one thrust axis to the next, since no least rotation from
-upright exists there.
+yaw, and body y is perpendicular to that direction.
 Derivatives along the samples are central differences, one-sided at both ends, as in the simplified simulation of
 Torrente et al., "Data-Driven MPC for Quadrotors" (2021), which leaves the heading free.
 """
@@ -54,7 +52,11 @@ def motion_along(
 
 
 def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array | float) -> tuple[Array, Array]:
-    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`."""
+    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`.
+
+    The free heading of a course that turns the vehicle upside down is propagated from sample to sample by the least
+    rotation from one thrust axis to the next, since no least rotation from upright exists there.
+    """
     pushed = _pushed(acceleration, gravity)
     b = pushed / np.linalg.norm(pushed, axis=1)[:, None]
     if b[:, 2].min() < STEEP:

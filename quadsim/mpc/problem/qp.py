@@ -158,12 +158,12 @@ def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
     distance = np.where(bounded, np.abs(np.where(bounded, bound, 0.0) - values), 0.0)
     violation = np.concatenate([lower - values, values - upper, np.abs(qp.A @ x - qp.b)])
     return KKTResiduals(
-        stationarity=_largest(gradient),
+        stationarity=_largest_size(gradient),
         primal=float(np.max(violation, initial=0.0)),  # NaN stays NaN
-        complementarity=_largest(multipliers * distance),
-        dual=_largest(np.where(bounded, 0.0, multipliers)),
+        complementarity=_largest_size(multipliers * distance),
+        dual=_largest_size(np.where(bounded, 0.0, multipliers)),
     )
 
 
-def _largest(values: Array) -> float:
+def _largest_size(values: Array) -> float:
     return float(np.max(np.abs(values), initial=0.0))

@@ -57,7 +57,7 @@ def stabilising(
     names = states or _VEHICLES_STATES
     hidden = undetected(A, C)
     if hidden.size:
-        raise ValueError(f"nothing weighted shows {_listed(hidden, names)}, which would not come to rest")
+        raise ValueError(f"nothing weighted shows {_state_names(hidden, names)}, which would not come to rest")
     try:
         P = scipy.linalg.solve_discrete_are(A, B, C.T @ Q @ C, R)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -65,7 +65,7 @@ def stabilising(
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     moving = _states_of(_moving(A - B @ K))
     if moving.size:
-        raise ValueError(f"with these weights nothing brings {_listed(moving, names)} to rest")
+        raise ValueError(f"with these weights nothing brings {_state_names(moving, names)} to rest")
     return np.asarray(P), np.asarray(K)
 
 
@@ -107,7 +107,7 @@ def _states_of(basis: Array) -> Indices:
     return np.flatnonzero(np.linalg.norm(basis, axis=1) > _PART)
 
 
-def _listed(indices: Indices, names: Sequence[str]) -> str:
+def _state_names(indices: Indices, names: Sequence[str]) -> str:
     """Return the names of states, of `state i` where one has none."""
     listed = []
     for i in indices.tolist():

@@ -130,16 +130,16 @@ def tables(problem: Problem) -> Tables:
     axis_tables = []
     first = 0
     for part in parts:
-        axis_tables.append(_axis(rows, part, first, N))
+        axis_tables.append(_axis_tables(rows, part, first, N))
         first += part.T.shape[1]
-    row_tables = [_row(rows, i, axis_tables) for i in range(rows.l1.size)]
+    row_tables = [_row_tables(rows, i, axis_tables) for i in range(rows.l1.size)]
     most_states = max(len(part.B) for part in axis_tables)
     _require_at_most(MOST_STATES, most_states, "states of an axis")
     _require_at_most(MOST_STEP_ROWS, len(row_tables), "rows of a step")
     steps = slice(None)
     if (rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all():
         steps = slice(0, 1)
-    scale = _scale(axis_tables, row_tables, T, N)
+    scale = _row_scales(axis_tables, row_tables, T, N)
     return Tables(
         problem=problem,
         axes=axis_tables,
@@ -333,7 +333,7 @@ def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
     return parts, T
 
 
-def _axis(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
+def _axis_tables(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
     n = part.states.size
     m = part.T.shape[1]
     objective = part.problem.objective
@@ -392,7 +392,7 @@ def _gains(A: Array, B: Array, Q: Array, Q_end: Array, R: Array, S: Array, N: in
     return K, inverse
 
 
-def _row(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
+def _row_tables(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
     axis = -1
     for g, part in enumerate(axes):
         if i in part.rows:
@@ -410,7 +410,7 @@ def _row(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
     return RowTables(axis=axis, later=bool(rows.of_states[i]), terms=terms, l1=l1, compliance=compliance)
 
 
-def _scale(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
+def _row_scales(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
     """(N, m) 1 / sqrt of each row's response to itself."""
     scale = np.zeros((N, len(rows)))
     for r, row in enumerate(rows):

@@ -45,14 +45,14 @@ class DaqpDense:
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = 5  # always active
         rows = np.concatenate([_dense(qp.G), _dense(qp.A)])
-        bounds = _bounds(qp)
+        bounds = _sides(qp)
         self._finite = np.isfinite(bounds)
         self._model.setup(_dense(qp.P), qp.c.copy(), rows, *bounds, sense)
 
     def solve(self, qp: QP) -> Solution:
         """See `quadsim.mpc.problem.qp.Backend.solve`."""
         started = clock.perf_counter()
-        upper, lower = _bounds(qp)
+        upper, lower = _sides(qp)
         same = qp.P is self._qp.P and qp.A is self._qp.A and qp.G is self._qp.G
         if same and np.array_equal(np.isfinite([upper, lower]), self._finite):
             self._model.update(f=qp.c, bupper=upper, blower=lower)
@@ -82,6 +82,6 @@ def _dense(matrix: Matrix) -> Array:
     return np.array(matrix, order="C")
 
 
-def _bounds(qp: QP) -> tuple[Array, Array]:
+def _sides(qp: QP) -> tuple[Array, Array]:
     """Return the upper and lower sides of [x; G x; A x]."""
     return np.concatenate([qp.x_u, qp.h_u, qp.b]), np.concatenate([qp.x_l, qp.h_l, qp.b])

@@ -25,7 +25,7 @@ COMMANDS: Final = (
 )
 """Meaning of the field `commands` of controllers that command all of these."""
 TARGET_BOUNDS: Final = "only where an autopilot flies; of an attitude, bounds on the body rates that its error commands"
-"""Meaning of the field `target_bounds` of such laws."""
+"""Meaning of the field `target_bounds` of such controllers."""
 LEAST_THRUST = 0.5
 MOST_THRUST = 0.9
 """Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""

@@ -27,7 +27,7 @@ Horizon = Annotated[int, Ge(1), Le(LARGEST_HORIZON)]
 KktEvery = Annotated[
     int, Ge(1), doc("[periods] interval at which KKT residuals are computed and logged; 1: every period")
 ]
-Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
+Law = Annotated[str, doc("the controller, by its name in `quadsim list`")]
 
 
 class ControllerTable:

@@ -4,10 +4,7 @@ In each period, the model is linearised along the previous plan, at the nodes' s
 
     min  sum |C_r (s_i - s_i^r)|^2_Q + |u_i - u_i^r|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i,  s_0 measured
 
-is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005). The states s contain the
-quaternion q_r* q instead of q, with the node's reference q_r: a rotation of four numbers that makes both kinds of
-`Nonlinear.attitude_error` linear with constant weights.  A measured state enters only as s_0; node 0 is linearised at
-the stored state.
+is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005).
 """
 
 from __future__ import annotations
@@ -99,6 +96,10 @@ _LawStruct: Final = struct("quadsim_nonlinear")
 
 class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
+
+    The states s contain the quaternion q_r* q instead of q, with the node's reference q_r: a rotation of four numbers
+    that makes both kinds of `Nonlinear.attitude_error` linear with constant weights.  A measured state enters only as
+    s_0; node 0 is linearised at the stored state.
 
     The controller is in C, `quadsim_nonlinear.c`, around the program of `quadsim_nmpc.h`; exported controllers are the
     same files.  Here it gets its numbers, its half-spaces and its clock, and its answers are checked.
@@ -213,7 +214,7 @@ class NonlinearMPC:
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
-        raise TypeError("a law in C cannot be copied or pickled: make another")
+        raise TypeError("a controller in C cannot be copied or pickled: make another")
 
     def _make_ramp(self) -> RampObserver | None:
         settings = self.settings

@@ -197,7 +197,7 @@ def _of_states(constraint: Constraint, vehicle: Vehicle, model: RigidBody, n: in
     C = np.zeros((m, n))
     D = np.zeros((m, N_ROTORS))
     if constraint.name in OWN_NAMES:
-        rule = f"named otherwise than {', '.join(OWN_NAMES)}, the law's own bounds"
+        rule = f"named otherwise than {', '.join(OWN_NAMES)}, the controller's own bounds"
         raise ParameterError("controller", constraint.name, "further rows of that name", rule)
     if constraint.E is not None and constraint.E.any():
         rule = "without steps of rotor speeds, which input_bounds.slew bounds"

@@ -137,7 +137,7 @@ class RobustPreparation:
         )
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
-        """Take over the rotor speeds, the commands under way and the disturbance of the previous law."""
+        """Take over the rotor speeds, the commands under way and the disturbance of the previous controller."""
         if memory is not None:
             if memory.targets == bool(self._robust.targets):
                 self._rotors[:] = memory.rotors

@@ -58,12 +58,16 @@ def differentiator(samples: int, period: float, *, degree: int = 2, first: float
         raise ParameterError("controller", "period", period, "positive and finite")
     t = period * (first + np.arange(samples))
     fit = np.linalg.pinv(np.vander(t, degree + 1, increasing=True))
-    return read_only(fit * np.array([[float(math.factorial(order))] for order in range(degree + 1)]))
+    factorials = [float(math.factorial(order)) for order in range(degree + 1)]
+    return read_only(fit * np.array(factorials)[:, None])
 
 
 def target_of(reference: Array, operator: Array) -> Target:
     """Return the target from a preview (N, 4) of x, y, z [m], yaw [rad] and its `differentiator` (degree + 1, N)."""
     value, rate, acceleration, *higher = operator @ reference
+    derivatives = {}
+    for name, row in zip(("jerk", "snap"), higher, strict=False):
+        derivatives[name] = row[:3]
     return Target(
         position=value[:3],
         velocity=rate[:3],
@@ -71,5 +75,5 @@ def target_of(reference: Array, operator: Array) -> Target:
         yaw=float(value[3]),
         yaw_rate=float(rate[3]),
         yaw_acceleration=float(acceleration[3]),
-        **{name: each[:3] for name, each in zip(("jerk", "snap"), higher, strict=False)},
+        **derivatives,
     )

@@ -136,11 +136,11 @@ def nonlinear_program(
     if price is not None:
         prices[2] = _halved(*price)
     places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
-    stated, groups = _stated(problem, places, prices)
+    stated, groups = _stated_rows(problem, places, prices)
     slack_scale = np.ones(len(prices))
     for slack, group in groups.items():
         slack_scale[group] = problem.rows.slack_scale[slack]
-    bounds = _bounds(stated, horizon)
+    bounds = _upper_bounds(stated, horizon)
     most_rows = horizon * (N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(stated) // 2 + faces)
     terms: list[Any] = []
     first_terms = [0]  # of each row, and the end
@@ -260,7 +260,7 @@ def _first_rows(problem: Problem) -> dict[str, int]:
     return first
 
 
-def _stated(
+def _stated_rows(
     problem: Problem, places: int, prices: list[tuple[float, float]]
 ) -> tuple[list[_StatedRow], dict[int, int]]:
     """Return all rows but the bounds of inputs, tilt and body rates, and append their prices.
@@ -308,10 +308,10 @@ def _require_alike(name: str, lower: Array, upper: Array) -> None:
     """Reject bounds (N,) that differ from step to step, where the core has one number for all."""
     for side in (lower, upper):
         if (side != side[0]).any():
-            raise ParameterError("controller", name, side.tolist(), "the same at all steps of the nonlinear law")
+            raise ParameterError("controller", name, side.tolist(), "the same at all steps of the nonlinear MPC")
 
 
-def _bounds(rows: list[_StatedRow], horizon: int) -> Array:
+def _upper_bounds(rows: list[_StatedRow], horizon: int) -> Array:
     """Return the upper bounds of rows in the first nodes (nodes, rows), of which the last holds in all that follow."""
     bounds = np.full((horizon, len(rows)), _HARD)
     for k, row in enumerate(rows):
