@@ -99,6 +99,7 @@ docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a 
 	@$(PY) docs/tools/gallery.py films
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html
+	@$(PY) docs/tools/site_search.py
 	@$(PY) docs/tools/built.py
 	@! grep -lE 'src="https?:|<link[^>]*href="https?:[^"]*\.(css|js)' site/*.html || { echo "These pages need a network." >&2; false; }
 	@OPENBLAS_NUM_THREADS=1 $(PY) docs/fly/build.py

@@ -21,6 +21,7 @@ import matplotlib as mpl
 import notebook
 import pytest
 import remake
+import site_search
 from _pytest.mark.structures import ParameterSet
 from golden_numbers import ABLATION, PAPER, ablation_entry, paper_entry, read
 
@@ -93,6 +94,16 @@ def test_a_page_as_built_repeats_no_block(page: Path) -> None:
         again = f"<pre>{escape(blocks[0])}</pre>" + whole
         assert list(built.mistakes(text, again)) == [f"a block is shown again in place of what should follow: {first}"]
         assert f"a block is missing: {first}" in list(built.mistakes(text, ""))
+
+
+def test_the_sites_search_corrects_long_words_alone_and_is_changed_once() -> None:
+    """Of the script's line that takes a word within two edits; another script is refused."""
+    line = 'p=e(t.terms[c],r);typeof p<"u"&&l.add(c,(h-p)/h)'
+    changed = site_search.limited(f"before;{line};after")
+    assert changed == 'before;p=e(t.terms[c],r);typeof p<"u"&&p<=(r.length<5?0:r.length<8?1:2)&&l.add(c,(h-p)/h);after'
+    for other in (changed, f"{line};{line}", "none"):
+        with pytest.raises(ValueError, match="must compare words in one place"):
+            site_search.limited(other)
 
 
 @pytest.mark.slow("pages")

@@ -171,7 +171,8 @@ SLOW_MARGINS = [(law, quantity) for law in LAWS if law != "lqr" for quantity in 
 
 
 @pytest.mark.parametrize(
-    ("law", "quantity"), [*MARGINS, *(pytest.param(*each, marks=pytest.mark.slow("stability")) for each in SLOW_MARGINS)]
+    ("law", "quantity"),
+    [*MARGINS, *(pytest.param(*each, marks=pytest.mark.slow("stability")) for each in SLOW_MARGINS)],
 )
 def test_the_loop_loses_its_stability_where_the_eigenvalues_say(law: str, quantity: str) -> None:
     exponent_of, low, high = THEORY[quantity]

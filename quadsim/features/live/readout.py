@@ -56,7 +56,7 @@ READOUT_STYLE: Final = f"""<style>
 .hints{{bottom:16px}}.over{{top:16px}}.hints .key{{font-size:12px}}
 .hints div{{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content;
  max-width:calc(100vw - 400px)}}
-.u-legend .{FURTHER}{{display:none}}
+.u-legend .{FURTHER}{{display:none}}.mantine-Slider-markLabel{{padding-top:3px}}
 .touch{{display:none}}
 @media (pointer:coarse){{.touch{{display:inline}}.mouse{{display:none}}.mantine-Button-root{{min-height:36px}}}}
 @media (max-width:36em){{

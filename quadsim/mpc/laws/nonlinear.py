@@ -31,7 +31,7 @@ from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
 from quadsim.mpc.space import Avoidance, Shape, Space
-from quadsim.mpc.tables.climb import CLIMB, ClimbBounds, require_climb
+from quadsim.mpc.tables.climb import CLIMB, ClimbBounds, climbing_targets, require_climb, within_tilt
 from quadsim.mpc.tables.commands import (
     COMMANDS,
     TARGET_BOUNDS,
@@ -304,7 +304,17 @@ class Nonlinear(TargetTable):
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
         if self.commands == ROTORS:
             return self.input_bounds.actuators(vehicle)
-        return self.target_bounds.actuators(vehicle)
+        return climbing_targets(self.target_bounds.actuators(vehicle), vehicle, self.level_climb(vehicle))
+
+    def level_climb(self, vehicle: Vehicle) -> Pair | None:
+        """Return the bounds on the climb acceleration in level flight that hold them up to the bound on the tilt.
+
+        Raises:
+            ParameterError: hover is not within them.
+        """
+        if self.climb_acceleration is None or self.tilt is None:
+            return None
+        return within_tilt(vehicle, self.climb_acceleration, self.tilt)
 
     def outputs(self) -> tuple[Array, Array]:
         """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""

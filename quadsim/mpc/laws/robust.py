@@ -29,6 +29,7 @@ from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight, obj
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
 from quadsim.mpc.space import Shape, Space
 from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded
+from quadsim.mpc.tables.climb import climbing_targets
 from quadsim.mpc.tables.commands import (
     COMMANDS,
     TARGET_BOUNDS,
@@ -171,7 +172,7 @@ class Robust(TargetTable, Bounded):
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
         if self.commands == ROTORS:
             return super().actuators(vehicle)
-        return self.target_bounds.actuators(vehicle)
+        return climbing_targets(self.target_bounds.actuators(vehicle), vehicle, self.climb_acceleration)
 
     def objective(self) -> Objective:
         """See `quadsim.mpc.tables.bounded.Weighted.objective`."""
@@ -245,7 +246,7 @@ class Robust(TargetTable, Bounded):
             penalty = self.soft.penalty(len(names))
         origins = tuple(origin_of_state(INDEX[name]) for name in names)
         outputs = Constraint(name="outputs", lower=lower, upper=upper, C=C_c, penalty=penalty, origins=origins)
-        bounds = self.target_bounds.actuators(vehicle)
+        bounds = self.actuators(vehicle)
         rates = tuple(Origin(f"target of body rate {axis}", "deg/s", math.degrees(1.0)) for axis in "xyz")
         targets = Constraint(
             name="targets",

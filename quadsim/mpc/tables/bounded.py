@@ -27,7 +27,7 @@ from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.solvers import ALIASES, SOLVERS, Solver, find_solver
 from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.mpc.space import Avoidance, Shape, Space
-from quadsim.mpc.tables.climb import CLIMB, ClimbBounds, climb_of_rotors, climb_of_targets, require_climb
+from quadsim.mpc.tables.climb import CLIMB, ClimbBounds, climb_of_rotors, require_climb
 from quadsim.mpc.tables.commands import InputBounds, InputWeights
 from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Law, Range, ranges, require_ordered
 from quadsim.state import REFERENCE_RATES, STATE_NAMES, Array
@@ -177,13 +177,9 @@ class Bounded(Weighted):
     def constraints(self, vehicle: Vehicle) -> tuple[Constraint, ...]:
         """Return the rows in addition to `bounds`."""
         polytopes = rows_of(self.polytopes)
-        if self.climb_acceleration is None:
+        if self.climb_acceleration is None or self.commands != ROTORS:
             return polytopes
-        if self.commands == ROTORS:
-            climb = climb_of_rotors(vehicle, self.climb_acceleration)
-        else:
-            climb = climb_of_targets(vehicle, self.climb_acceleration)
-        return climb, *polytopes
+        return climb_of_rotors(vehicle, self.climb_acceleration), *polytopes
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `Weighted.problem`."""

@@ -3,7 +3,7 @@
 In level flight a thrust U climbs with U / m - g.  The rows are linear in what the law commands, and exact where the
 rotors climb at the bound without turning the vehicle: D u, with the slope D of the model, is bounded by its values at
 the commands of these two climbs.  Rows on commands always have an answer, and rotors that lag stay between the commands
-that they follow.
+that they follow.  An autopilot's target of the thrust is bounded itself.
 
 Tilted by phi, the vehicle climbs with U cos(phi) / m - g.  A linear law does not know that; a nonlinear one would turn
 over to descend faster, so that it needs a bound on the tilt, up to which it then holds the lower bound.
@@ -12,6 +12,7 @@ over to descend faster, so that it needs a bound on the tilt, up to which it the
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated, Final
 
 import numpy as np
@@ -19,11 +20,12 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Pair
+from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.problem.constraints import Constraint, Origin
 from quadsim.mpc.problem.model import continuous_model
 from quadsim.mpc.tables.controller import require_ordered
 from quadsim.state import INDEX, Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import Vehicle
 
 CLIMB: Final = "climb_acceleration"
 """The signal of the audit that the rows bound, and the field that states them."""
@@ -73,7 +75,7 @@ def climb_speeds(vehicle: Vehicle, pair: Pair) -> tuple[Array, Array]:
     return lower, upper
 
 
-def climb_constraint(row: Array, lower: Array, upper: Array, scale: Array | float = 1.0) -> Constraint:
+def climb_constraint(row: Array, lower: Array, upper: Array, scale: float = 1.0) -> Constraint:
     """Return the constraint of a row D (4,) [m/s^2 per command], between the commands of its two climbs (4,).
 
     `scale` has the command per input of 1, where inputs are shares.
@@ -93,8 +95,13 @@ def climb_of_rotors(vehicle: Vehicle, pair: Pair, scale: float = 1.0) -> Constra
     return climb_constraint(row, *climb_speeds(vehicle, pair), scale)
 
 
-def climb_of_targets(vehicle: Vehicle, pair: Pair, scale: Array | float = 1.0) -> Constraint:
-    """Return the row over an autopilot's targets, of which the first is the collective thrust; `scale` as above."""
-    level = np.eye(N_ROTORS)[0]
-    lower, upper = (thrust * level for thrust in climb_thrusts(vehicle, pair))
-    return climb_constraint(level / vehicle.mass, lower, upper, scale)
+def climbing_targets(bounds: ActuatorBounds, vehicle: Vehicle, pair: Pair | None) -> ActuatorBounds:
+    """Return bounds on an autopilot's targets with those of these two climbs on the collective thrust, the first."""
+    if pair is None:
+        return bounds
+    lower, upper = climb_thrusts(vehicle, pair)
+    u_min = bounds.u_min.copy()
+    u_max = bounds.u_max.copy()
+    u_min[0] = max(u_min[0], lower)
+    u_max[0] = min(u_max[0], upper)
+    return replace(bounds, u_min=u_min, u_max=u_max)

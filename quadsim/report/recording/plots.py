@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from quadsim.controller import OPTIMAL, Phase
+from quadsim.errors import printable
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
 from quadsim.flight.metrics import never_took_off, unrecovered
@@ -36,7 +37,7 @@ from quadsim.report.recording.world import (
     panels,
     time_column,
 )
-from quadsim.report.table import ABSENT, to_markdown
+from quadsim.report.table import ABSENT
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -257,14 +258,26 @@ def send_texts(recording: rr.RecordingStream, run: FlightRecord) -> None:
     times = np.array([event.time for event in events])
     log = rr.TextLog.columns(text=[event.text for event in events], level=[event.level for event in events])
     recording.send_columns("events", [time_column(times)], log)
-    rows = []
+    recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def _summary(run: FlightRecord) -> str:
+    """The flight, its tracking and the verdicts, as lists: their lines wrap, where a narrow view cuts a table's."""
+    lines = [f"**{run.name}**\n"]
+    group = ""
     for row in comparison_rows([run]):
         is_shown = row.group in ("Flight", "Tracking") or row.headline
         (cell,) = row.cells
-        if is_shown and cell.text not in ("", ABSENT):
-            rows.append(row)
-    document = rr.TextDocument(to_markdown(rows, [run.name]), media_type=rr.MediaType.MARKDOWN)
-    recording.log("summary", document, static=True)
+        if not is_shown or cell.text in ("", ABSENT):
+            continue
+        if row.group != group:
+            lines.append(f"\n{row.group}\n")
+            group = row.group
+        name = row.label
+        if row.unit:
+            name += f" [{row.unit}]"
+        lines.append(printable(f"- {name}: **{cell.text}**"))
+    return "\n".join(lines) + "\n"
 
 
 def _events(run: FlightRecord) -> list[_Event]:

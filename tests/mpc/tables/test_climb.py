@@ -12,7 +12,8 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
 from quadsim.flight.feasibility import Feasibility
-from quadsim.mpc.tables.climb import climb_of_rotors, climb_of_targets, climb_speeds, within_tilt
+from quadsim.mpc.tables.climb import climb_of_rotors, climb_speeds, climbing_targets, within_tilt
+from quadsim.mpc.tables.commands import TargetBounds
 from quadsim.rollout.flown import Flight
 from quadsim.vehicle import Vehicle, load_vehicle
 
@@ -68,18 +69,16 @@ def test_it_is_active_and_the_audit_holds(law: str) -> None:
 def test_its_ends_are_the_climbs_with_these_accelerations(vehicle: Vehicle) -> None:
     """With a map of the thrust and for rotors that differ, too; and the targets of an autopilot are the same climbs."""
     row = climb_of_rotors(vehicle, BOUNDS)
-    targets = climb_of_targets(vehicle, BOUNDS)
+    free = TargetBounds(thrust=(0.1 * vehicle.mass * vehicle.gravity, 9.0 * vehicle.mass * vehicle.gravity))
+    targets = climbing_targets(free.actuators(vehicle), vehicle, BOUNDS)
     assert row.D is not None
-    assert targets.D is not None
-    for speeds, ends, acceleration in zip(
-        climb_speeds(vehicle, BOUNDS), ((row.lower, targets.lower), (row.upper, targets.upper)), BOUNDS, strict=True
-    ):
+    ends = ((row.lower, targets.u_min), (row.upper, targets.u_max))
+    for speeds, (end, target), acceleration in zip(climb_speeds(vehicle, BOUNDS), ends, BOUNDS, strict=True):
         thrust = vehicle.thrusts(speeds).sum()
         assert thrust / vehicle.mass - vehicle.gravity == pytest.approx(acceleration)
-        np.testing.assert_allclose(row.D @ speeds, ends[0])
-        np.testing.assert_allclose(targets.D @ [thrust, 0.0, 0.0, 0.0], ends[1])
-    assert row.D @ vehicle.hover_speeds > row.lower
-    assert row.D @ vehicle.hover_speeds < row.upper
+        np.testing.assert_allclose(row.D @ speeds, end)
+        assert target[0] == pytest.approx(thrust)
+    assert row.lower < row.D @ vehicle.hover_speeds < row.upper
 
 
 def test_the_lower_bound_holds_up_to_the_tilt() -> None:

@@ -295,9 +295,9 @@ def test_the_summary_has_no_key_without_a_value_and_plots_end_with_the_flight(
     content: Content, short_run: Flight
 ) -> None:
     summary = content.rows("/summary", "text")[0][0]
-    lines = [line.strip("| ").split("|") for line in summary.splitlines() if line.startswith("|")]
+    lines = [line.removeprefix("- ").partition(": ") for line in summary.splitlines() if line.startswith("- ")]
     assert len(lines) > 10
-    assert [cells for cells in lines[2:] if cells[-1].strip() in ("", "-")] == []
+    assert [value for _, _, value in lines if value.strip("* ") in ("", "-")] == []
     assert "events" not in summary, "it has none"
     blueprint = content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
     batches = [chunk.to_record_batch() for chunk in blueprint if chunk.entity_path.endswith("/TimeAxis")]

@@ -21,7 +21,7 @@ from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight
 from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, P, RigidBody, V, W, rigid_body
-from quadsim.mpc.tables.climb import climb_constraint, climb_of_rotors, climb_of_targets, climb_speeds, within_tilt
+from quadsim.mpc.tables.climb import climb_constraint, climb_of_rotors, climb_speeds
 from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.state import EULER, EULER_RATE, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -164,9 +164,9 @@ def _own_bounds(
         upper = np.full(TILT_SIDES, math.sin(tilt) * math.cos(math.pi / TILT_SIDES))
         penalty = _penalty(settings, TILT_SIDES, 1.0 / math.cos(tilt))  # in the sine of the tilt
         yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
-    if settings.climb_acceleration is not None:
-        assert settings.tilt is not None
-        yield _climb(within_tilt(vehicle, settings.climb_acceleration, settings.tilt), vehicle, model)
+    climb = settings.level_climb(vehicle)
+    if climb is not None and not model.targets:
+        yield _climb(climb, vehicle, model)
     rates = settings.largest_rates
     if np.isfinite(rates).any():
         penalty = _penalty(settings, 3, 1.0)
@@ -174,9 +174,7 @@ def _own_bounds(
 
 
 def _climb(pair: Pair, vehicle: Vehicle, model: RigidBody) -> Constraint:
-    """Return the bounds on the climb acceleration as a row over the inputs."""
-    if model.targets:
-        return climb_of_targets(vehicle, pair, model.scale)
+    """Return the bounds on the climb acceleration as a row over the inputs that turn rotors."""
     if model.inputs is Inputs.SPEED:
         return climb_of_rotors(vehicle, pair, vehicle.speed_max)
     row = model.effectiveness[0] * model.largest_thrust  # in the thrusts it is linear
