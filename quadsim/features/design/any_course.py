@@ -104,13 +104,13 @@ def course_for(
     if law not in DESIGNED_LAWS:
         raise UnknownNameError("controller", law, DESIGNED_LAWS)
     require_size(size)
-    tuning = design_for(vehicle, tilt)
+    design = design_for(vehicle, tilt)
     if name in COURSES:
-        return course_by_rule(name, vehicle, tuning, size)
+        return course_by_rule(name, vehicle, design, size)
     if not is_trajectory(name) and not name.endswith(".toml") and name not in scenario_names():
         hint = "or give a path ending in .toml or .csv"
         raise UnknownNameError("course", name, course_names(), hint=hint)
-    return fitted_course(name, vehicle, file, tuning, avoids=law in AVOIDING, size=size)
+    return fitted_course(name, vehicle, file, design, avoids=law in AVOIDING, size=size)
 
 
 def is_trajectory(course: str) -> bool:
@@ -124,7 +124,7 @@ def course_names() -> list[str]:
 
 
 def fitted_course(
-    name: str, vehicle: Vehicle, file: str, tuning: Design, *, avoids: bool, size: float | None = None
+    name: str, vehicle: Vehicle, file: str, design: Design, *, avoids: bool, size: float | None = None
 ) -> FirstCourse:
     """Return a course made for a vehicle.
 
@@ -132,7 +132,7 @@ def fitted_course(
         name: of a scenario of the library, or a path to a scenario file (.toml) or to a table (.csv).
         vehicle: the numbers.
         file: where these are.
-        tuning: of its controller.
+        design: of its controller.
         avoids: whether the controller can keep clear of obstacles.
         size: longest side of the course [m]; None: by the rules of this module.
 
@@ -140,7 +140,7 @@ def fitted_course(
         InputError: the course cannot be read, or such a controller cannot fly it.
     """
     if is_trajectory(name):
-        base = _of_table(name, file, tuning)
+        base = _of_table(name, file, design)
     else:
         base = load_scenario(name)
     assembly = Assembly(base)
@@ -155,10 +155,10 @@ def fitted_course(
     else:
         by_extent = vehicle.enclosing_radius / assembly.vehicle.enclosing_radius
     length = _length_factor(name, samples, size, by_extent)
-    time, response = _time_factor(samples, length, vehicle, tuning)
+    time, response = _time_factor(samples, length, vehicle, design)
     if base.obstacles or base.regions:
         time = max(time, math.sqrt(length))
-    allowed = ALLOWED_SHARE * eight_length(vehicle, tuning)
+    allowed = ALLOWED_SHARE * eight_length(vehicle, design)
     touches = base.effects.ground is not None and base.effects.ground.contact
     lift = 0.0
     if not touches:
@@ -169,14 +169,14 @@ def fitted_course(
     return _written(name, base, assembly, scale, response, allowed, samples, own=own, size=size, touches=touches)
 
 
-def _of_table(path: str, file: str, tuning: Design) -> Scenario:
+def _of_table(path: str, file: str, design: Design) -> Scenario:
     """Return a scenario that flies a table, from its first row."""
     table = read_course_table(Path(path))
     x, y, z, yaw = table.poses[0].tolist()
     tables = {
         "name": "table",
         "description": "a table",
-        "control_period": tuning.period,
+        "control_period": design.period,
         "duration": later(float(table.t[-1]) + 2.0 * _REST),
         "vehicle": {"file": file},
         "initial": {"position": [x, y, z], "euler": [0.0, 0.0, round(math.degrees(yaw), 6)]},
@@ -269,12 +269,12 @@ def _length_factor(name: str, samples: SampledCourse, size: float | None, by_ext
     return size / samples.size
 
 
-def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, tuning: Design) -> tuple[float, float]:
+def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, design: Design) -> tuple[float, float]:
     """Return the factor of times, and the response time [s] of a filter that the course needs; 0 for its own.
 
     The course asks for `SHARE` of the limits, and its filter is as slow as that of steps by rule, at least.
     """
-    by_rule = 3.0 / step_bandwidth(tuning, max(length * samples.largest_jump, STEP))
+    by_rule = 3.0 / step_bandwidth(design, max(length * samples.largest_jump, STEP))
     is_sharp = samples.jumps or samples.corners
     response = 0.0
     if is_sharp and not samples.response_time:
@@ -284,7 +284,7 @@ def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, tuning
 
     def share(time: float) -> float:
         filtered = response or time * samples.response_time
-        shares = [_share(samples, length, time, filtered, vehicle, tuning)]
+        shares = [_share(samples, length, time, filtered, vehicle, design)]
         if is_sharp and not response:
             shares.append(by_rule / filtered)
         if samples.jumps and response:
@@ -308,7 +308,7 @@ def _where_one(share: Callable[[float], float]) -> float:
 
 
 def _share(
-    samples: SampledCourse, length: float, time: float, response_time: float, vehicle: Vehicle, tuning: Design
+    samples: SampledCourse, length: float, time: float, response_time: float, vehicle: Vehicle, design: Design
 ) -> float:
     """Return the largest demand of a course, with factors of lengths and times, over what it may ask for."""
     interval = time * samples.interval
@@ -330,17 +330,17 @@ def _share(
     fastest = float(np.linalg.norm(velocity[:, :3], axis=1).max())
     turning = float(np.abs(velocity[:, 3]).max())
     shares = [
-        fastest / (SHARE * tuning.fastest),
-        turning / (SHARE * HEADING_STEP * tuning.heading),
+        fastest / (SHARE * design.fastest),
+        turning / (SHARE * HEADING_STEP * design.heading),
     ]
     if not samples.jumps:  # of steps the filter's bandwidth is the measure
         level = float(np.hypot(acceleration[:, 0], acceleration[:, 1]).max())
-        shares.append(level / (SHARE * vehicle.gravity * tuning.acceleration))
+        shares.append(level / (SHARE * vehicle.gravity * design.acceleration))
         upward = float(np.abs(acceleration[:, 2]).max())
-        shares.append(upward / (SHARE * min(tuning.authority.climb, tuning.authority.sink)))
+        shares.append(upward / (SHARE * min(design.authority.climb, design.authority.sink)))
         largest = float(np.linalg.norm(acceleration[:, :3], axis=1).max())
         if fastest > 0.0 and not samples.corners:
-            shares.append(largest / fastest / (_FREQUENCY_RATIO * tuning.bandwidth))
+            shares.append(largest / fastest / (_FREQUENCY_RATIO * design.bandwidth))
     return max(shares)
 
 

@@ -1,4 +1,9 @@
-"""Control authority at hover: thrust and torque reserves of the rotors, and their response time."""
+"""Control authority at hover: what thrust and torque the rotors have in reserve, and how fast they respond.
+
+Torques at a thrust of m g are the extremes of a linear programme in the squared rotor speeds v, each within its limits:
+row i of the allocation matrix times v is torque i.  Divided by the inertia, they are angular accelerations.
+`rules.py` designs a controller from these numbers; `vehicle_report.py` and `shortfalls.py` show them.
+"""
 
 from __future__ import annotations
 
@@ -40,38 +45,45 @@ class Authority:
     climb: float  # largest upward acceleration from hover, level [m/s^2]
     sink: float  # largest downward acceleration from hover, level [m/s^2]
     turning: tuple[float, float, float]
-    """(3,) angular acceleration about body x, y, z that is to be had both ways, without torque about the other axes,
+    """(3,) angular acceleration about body x, y, z available in both directions, without torque about the other axes,
     while thrust carries the weight [rad/s^2]."""
     lag: float  # the longer time constant of a rotor's speed [s]; 0 where the vehicle gives none
     munk: float  # growth rate of a tilt by Munk's moment over the level air speed [1/m]; 0 without body drag
 
 
-def authority(vehicle: Vehicle) -> Authority:
-    """The figures of a vehicle."""
+def control_authority(vehicle: Vehicle) -> Authority:
+    """Return what a vehicle has in reserve at hover."""
     hover = vehicle.thrusts(vehicle.hover_speeds)
-    lowest, highest = (vehicle.thrusts(np.full(N_ROTORS, speed)) for speed in (vehicle.speed_min, vehicle.speed_max))
+    lowest = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_min))
+    highest = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
     ratio = float((highest / hover).min())
-    x, y, z = (
-        min(-torque.lowest_pure, torque.highest_pure) / inertia
-        for torque, inertia in zip(torque_ranges(vehicle), vehicle.inertia, strict=True)
-    )
     return Authority(
         thrust_to_weight=ratio,
         hover_share=(vehicle.hover_speed - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
         steady_tilt=math.acos(min(1.0, 1.0 / ratio)),
         climb=(ratio - 1.0) * vehicle.gravity,
         sink=(1.0 - float((lowest / hover).max())) * vehicle.gravity,
-        turning=(x, y, z),
+        turning=_turning(vehicle),
         lag=max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0),
         munk=_munk(vehicle),
     )
 
 
-def _munk(vehicle: Vehicle) -> float:
-    """The larger p / v of roll and pitch [1/m].
+def _turning(vehicle: Vehicle) -> tuple[float, float, float]:
+    """Return the angular accelerations [rad/s^2] about x, y, z that are available in both directions."""
+    accelerations = []
+    for torque, inertia in zip(torque_ranges(vehicle), vehicle.inertia, strict=True):
+        both_ways = min(-torque.lowest_pure, torque.highest_pure)
+        accelerations.append(both_ways / inertia)
+    x, y, z = accelerations
+    return x, y, z
 
-    At a level speed v and a small tilt, an inflow moment k, the vehicle's or that of its body, turns it by k v^2 tilt
-    further across its way: J tilt'' = k v^2 tilt, which grows as exp(p t).
+
+def _munk(vehicle: Vehicle) -> float:
+    """Return the larger p / v of roll and pitch [1/m], p the rate at which the air makes a tilt grow.
+
+    At level speed v, an inflow moment k, the vehicle's or that of its body, increases a small tilt by the torque
+    k v^2 tilt: J tilt'' = k v^2 tilt, which grows as exp(p t), p = v sqrt(k / J).
     """
     inflow = vehicle.inflow_moment
     if inflow is None and vehicle.body_drag is not None:
@@ -82,7 +94,7 @@ def _munk(vehicle: Vehicle) -> float:
 
 
 def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
-    """The largest torques of each sign about x, y, z with the thrust held at the weight and every rotor in its range.
+    """Return the largest torques of each sign about x, y, z, with thrust at the weight and every rotor in its range.
 
     A linear programme in the rotors' thrusts over their coefficients, the squared speeds v_i = w_i^2 unless the vehicle
     has a map of thrust: the torque about an axis is a row of the allocation matrix times v, the thrust is its first row
@@ -90,7 +102,8 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
     """
     ranges = []
     for axis, name in enumerate(FORCE_AXES):
-        (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
+        low, high = _extremes(vehicle, 1 + axis, pure=False)
+        low_pure, high_pure = _extremes(vehicle, 1 + axis, pure=True)
         ranges.append(
             TorqueRange(
                 axis=name,
@@ -106,21 +119,24 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
 
 
 def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
-    """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
+    """Return the smallest and largest torque [N m] of a row of the allocation matrix; `pure`: the others are zero."""
     linear, quadratic = vehicle.square_law
-    low, top = (linear * speed + quadratic * speed**2 for speed in (vehicle.speed_min, vehicle.speed_max))
-    matrix = top * vehicle.allocation  # in v / top, so that the programme is well scaled
+    lowest = linear * vehicle.speed_min + quadratic * vehicle.speed_min**2
+    highest = linear * vehicle.speed_max + quadratic * vehicle.speed_max**2
+    matrix = highest * vehicle.allocation  # in v / highest, so that the programme is well scaled
     units = np.abs(matrix).max(axis=1)
-    fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
-    equal = np.zeros(len(fixed))
-    equal[0] = vehicle.mass * vehicle.gravity / units[0]
+    held_rows = [0]  # thrust
+    if pure:
+        held_rows += [other for other in (1, 2, 3) if other != row]
+    held_values = np.zeros(len(held_rows))
+    held_values[0] = vehicle.mass * vehicle.gravity / units[0]
     extremes = []
     for sign in (1.0, -1.0):
         solution = linprog(
             sign * matrix[row] / units[row],
-            A_eq=matrix[fixed] / units[fixed, None],
-            b_eq=equal,
-            bounds=[(share, 1.0) for share in low / top],
+            A_eq=matrix[held_rows] / units[held_rows, None],
+            b_eq=held_values,
+            bounds=[(least, 1.0) for least in lowest / highest],
             method="highs",
         )
         assert solution.success, "hover itself is feasible"

@@ -169,18 +169,18 @@ def first_scenario(
     """
     if law not in DESIGNED_LAWS:
         raise UnknownNameError("controller", law, DESIGNED_LAWS)
-    tuning = design_for(vehicle, tilt)
+    design = design_for(vehicle, tilt)
     if isinstance(course, str):
-        course = course_by_rule(course, vehicle, tuning)
+        course = course_by_rule(course, vehicle, design)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course.name}".lower())[:80]
     if course.duration is None:
         for_duration = ""
     else:
         for_duration = f"duration = {course.duration}  # s\n"
-    text = f"""{_notes(vehicle, tuning, course, law)}
+    text = f"""{_notes(vehicle, design, course, law)}
 name = {_text(name)}
 description = {_text(f"{vehicle.name}: {course.about}")}
-{for_duration}control_period = {tuning.period}  # s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}
+{for_duration}control_period = {design.period}  # s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}
 
 [vehicle]
 file = {_text(file)}  # made for its numbers: remake this file when they change
@@ -191,10 +191,10 @@ file = {_text(file)}  # made for its numbers: remake this file when they change
 limit_speeds = true  # rotors saturate at their lowest and highest speed
 
 {course.reference}
-{_controller(law, vehicle, tuning, course)}
+{_controller(law, vehicle, design, course)}
 {_rotors(vehicle)}
 [effects.air]  # drag of the vehicle file
-{_disturbance(disturbance)}{course.tables}{_constraints(law, vehicle, tuning, course)}"""
+{_disturbance(disturbance)}{course.tables}{_constraints(law, vehicle, design, course)}"""
     return FirstScenario(text=text, size=course.size)
 
 
@@ -217,22 +217,22 @@ def _disturbance(disturbance: Disturbance | None) -> str:
     return text
 
 
-def _notes(vehicle: Vehicle, tuning: Design, course: FirstCourse, law: str) -> str:
+def _notes(vehicle: Vehicle, design: Design, course: FirstCourse, law: str) -> str:
     """Return the comments above the file: the figures it is based on."""
-    can = tuning.authority
+    can = design.authority
     limits = {
         "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
         "torque": "torque: 0.5 sqrt(alpha / tilt bound), alpha the smaller of roll's and pitch's",
-        "period": f"what a period of {1e3 * tuning.period:g} ms can serve",
+        "period": f"what a period of {1e3 * design.period:g} ms can serve",
     }
-    if tuning.tilt_stated:
-        stated = f" --tilt {_tilt(tuning):g}"
+    if design.tilt_stated:
+        stated = f" --tilt {_tilt(design):g}"
     else:
         stated = ""
     option = ""
     what = "The loop's bandwidth for x and y"
     then = (
-        f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
+        f"Without bounds it tolerates {1e3 * delay_margin(vehicle, design):.3g} ms more delay than it knows of.\n"
         "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; sources: quadsim/features/design/rules.py."
     )
     if law != "robust":
@@ -246,29 +246,29 @@ def _notes(vehicle: Vehicle, tuning: Design, course: FirstCourse, law: str) -> s
 # Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; \
 angular acceleration in reserve at hover
 # {can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.
-# {what} is w = {tuning.bandwidth:.3g} rad/s,
-# limited by {limits[tuning.limited_by]};
-# {tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. {then}
+# {what} is w = {design.bandwidth:.3g} rad/s,
+# limited by {limits[design.limited_by]};
+# {design.height:.3g} rad/s for z, {design.heading:.3g} rad/s for yaw. {then}
 """
 
 
-def largest_eight(vehicle: Vehicle, tuning: Design) -> tuple[float, Literal["tilt", "speed"]]:
+def largest_eight(vehicle: Vehicle, design: Design) -> tuple[float, Literal["tilt", "speed"]]:
     """The largest level acceleration [m/s^2] of a figure eight that the vehicle can fly, and what is reached there."""
-    tilting = vehicle.gravity * tuning.acceleration
+    tilting = vehicle.gravity * design.acceleration
     # Of (a sin wt, a/2 sin 2wt) the largest speed is sqrt(2) a w.
-    moving = tuning.fastest * _EIGHT_PEAK * EIGHT_RATIO * tuning.bandwidth / math.sqrt(2.0)
+    moving = design.fastest * _EIGHT_PEAK * EIGHT_RATIO * design.bandwidth / math.sqrt(2.0)
     if moving < tilting:
         return (moving, "speed")
     return (tilting, "tilt")
 
 
-def _eight_limit(vehicle: Vehicle, tuning: Design) -> str:
-    if largest_eight(vehicle, tuning)[1] == "speed":
-        return f"the fastest level speed, {tuning.fastest:.3g} m/s"
+def _eight_limit(vehicle: Vehicle, design: Design) -> str:
+    if largest_eight(vehicle, design)[1] == "speed":
+        return f"the fastest level speed, {design.fastest:.3g} m/s"
     return "the largest acceleration within the tilt bound"
 
 
-def course_by_rule(name: str, vehicle: Vehicle, tuning: Design, size: float | None = None) -> FirstCourse:
+def course_by_rule(name: str, vehicle: Vehicle, design: Design, size: float | None = None) -> FirstCourse:
     """Return one of `COURSES` for a vehicle, of a size [m], or by rule.
 
     Raises:
@@ -286,8 +286,8 @@ def course_by_rule(name: str, vehicle: Vehicle, tuning: Design, size: float | No
         reference = "[reference]  # no steps: every axis holds its initial position, yaw at 0\n"
         return _by_rule(vehicle, name, options, f"hover at {height:g} m", reference, 4.0, STEP, ALLOWED_SHARE * STEP)
     if name == "step":
-        return _steps(vehicle, tuning, options, STEP if size is None else size)
-    return _eight(vehicle, tuning, options, size)
+        return _steps(vehicle, design, options, STEP if size is None else size)
+    return _eight(vehicle, design, options, size)
 
 
 def require_size(size: float | None) -> None:
@@ -327,23 +327,23 @@ def _by_rule(
     )
 
 
-def step_bandwidth(tuning: Design, size: float) -> float:
+def step_bandwidth(design: Design, size: float) -> float:
     """Return the bandwidth [rad/s] of the filter of steps of a size [m].
 
     A step of s through a filter of bandwidth w_f lets the reference's velocity jump by w_f s: by no more than that of a
     step of `STEP`.
     """
-    return STEP_RATIO * min(tuning.bandwidth, tuning.height) * min(1.0, STEP / size)
+    return STEP_RATIO * min(design.bandwidth, design.height) * min(1.0, STEP / size)
 
 
-def _steps(vehicle: Vehicle, tuning: Design, options: str, size: float) -> FirstCourse:
+def _steps(vehicle: Vehicle, design: Design, options: str, size: float) -> FirstCourse:
     """Return steps in x, y and z."""
-    slowest = min(tuning.bandwidth, tuning.height)
+    slowest = min(design.bandwidth, design.height)
     why = f"3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
     if size > STEP:
         why += f", times {size:g}"
-    response = round(3.0 / step_bandwidth(tuning, size), 2)
-    start = later(max(1.0, 3.0 / tuning.bandwidth))
+    response = round(3.0 / step_bandwidth(design, size), 2)
+    start = later(max(1.0, 3.0 / design.bandwidth))
     hold = later(max(1.5, 1.2 * response))
     above = round(_height(vehicle, ALLOWED_SHARE * size) + size, 9)
     first, second, third, last = (round(start + i * hold, 9) for i in range(4))
@@ -358,11 +358,11 @@ z = [{{ start = {first}, stop = {third}, value = {above} }}]  # s, s, m
     return _by_rule(vehicle, "step", options, about, text, duration, size, ALLOWED_SHARE * size)
 
 
-def _eight(vehicle: Vehicle, tuning: Design, options: str, size: float | None) -> FirstCourse:
+def _eight(vehicle: Vehicle, design: Design, options: str, size: float | None) -> FirstCourse:
     """Return a figure eight: of a size [m], as fast as `SHARE` permits, or of that at which it turns with the loop."""
-    acceleration = SHARE * largest_eight(vehicle, tuning)[0]
-    by_rule = eight_length(vehicle, tuning)
-    limit = _eight_limit(vehicle, tuning)
+    acceleration = SHARE * largest_eight(vehicle, design)[0]
+    by_rule = eight_length(vehicle, design)
+    limit = _eight_limit(vehicle, design)
     length = by_rule
     why = f"such that it turns with {EIGHT_RATIO:g} w"
     about = f"a figure eight at {100.0 * SHARE:g} % of {limit}"
@@ -370,9 +370,9 @@ def _eight(vehicle: Vehicle, tuning: Design, options: str, size: float | None) -
         length = size
         why = "as --size states it"
         rate = min(
-            EIGHT_RATIO * tuning.bandwidth,
-            math.sqrt(2.0 * SHARE * vehicle.gravity * tuning.acceleration / (_EIGHT_PEAK * length)),
-            math.sqrt(2.0) * SHARE * tuning.fastest / length,
+            EIGHT_RATIO * design.bandwidth,
+            math.sqrt(2.0 * SHARE * vehicle.gravity * design.acceleration / (_EIGHT_PEAK * length)),
+            math.sqrt(2.0) * SHARE * design.fastest / length,
         )
         acceleration = 0.5 * _EIGHT_PEAK * length * rate**2
         about = (
@@ -391,20 +391,20 @@ ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose i
     return _by_rule(vehicle, "figure-eight", options, about, text, None, length, allowed, lasts=True)
 
 
-def eight_length(vehicle: Vehicle, tuning: Design) -> float:
+def eight_length(vehicle: Vehicle, design: Design) -> float:
     """Return the length [m] of the figure eight that turns with `EIGHT_RATIO` w at `SHARE` of the limits."""
-    acceleration = SHARE * largest_eight(vehicle, tuning)[0]
-    return in_digits(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
+    acceleration = SHARE * largest_eight(vehicle, design)[0]
+    return in_digits(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * design.bandwidth) ** 2), 3)
 
 
-def _controller(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
+def _controller(law: str, vehicle: Vehicle, design: Design, course: FirstCourse) -> str:
     if law in ("nonlinear", "rates"):
-        return _nonlinear(law, vehicle, tuning) + _nonlinear_avoidance(course)
-    return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning, course)}
+        return _nonlinear(law, vehicle, design) + _nonlinear_avoidance(course)
+    return f"""{_robust(vehicle, design) if law == "robust" else _baseline(law, vehicle, design, course)}
 [controller.input_bounds]
 speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
-slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
-{_avoidance(course, tuning)}"""
+slew = {[*_slew(design)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
+{_avoidance(course, design)}"""
 
 
 def _nonlinear_avoidance(course: FirstCourse) -> str:
@@ -414,11 +414,11 @@ def _nonlinear_avoidance(course: FirstCourse) -> str:
     return f"\n[controller.avoidance]\nmargin = {course.clearance}  # m, added\nsoft = {{}}\n"
 
 
-def _avoidance(course: FirstCourse, tuning: Design) -> str:
+def _avoidance(course: FirstCourse, design: Design) -> str:
     """Return the table that keeps clear of obstacles, and within regions, where there are any."""
     if course.clearance is None:
         return ""
-    place = tuning.weights[0]
+    place = design.weights[0]
     return f"""
 [controller.avoidance]  # planes between the plan and each obstacle
 margin = {course.clearance}  # m, added
@@ -429,10 +429,10 @@ quadratic = {in_digits(AVOIDANCE_WEIGHTS[1] * place)}  # l2: {AVOIDANCE_WEIGHTS[
 """
 
 
-def _nonlinear(law: str, vehicle: Vehicle, tuning: Design) -> str:
+def _nonlinear(law: str, vehicle: Vehicle, design: Design) -> str:
     """The table of nonlinear MPC, of rotor speeds or through the autopilot."""
-    stride = math.ceil(NODE / tuning.period - 1e-9)
-    nodes = math.ceil(AHEAD / (stride * tuning.period) - 1e-9)
+    stride = math.ceil(NODE / design.period - 1e-9)
+    nodes = math.ceil(AHEAD / (stride * design.period) - 1e-9)
     flown_by = "the vehicle's autopilot: its file's [autopilot], or by rule"
     commands = f'commands = "rates"  # thrust and body rates, flown by {flown_by}\n'
     bounds = ""
@@ -447,10 +447,10 @@ speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold;
 """
     return f"""[controller]
 type = "nonlinear"
-{commands}horizon = {stride * nodes}  # periods, {stride * nodes * tuning.period:.3g} s
-node = {round(stride * tuning.period, 9)}  # s, whole periods of {NODE:g} s or more
+{commands}horizon = {stride * nodes}  # periods, {stride * nodes * design.period:.3g} s
+node = {round(stride * design.period, 9)}  # s, whole periods of {NODE:g} s or more
 terminal = "lqr"
-tilt = {_tilt(tuning)}  # deg, the bound of the linear controllers
+tilt = {_tilt(design)}  # deg, the bound of the linear controllers
 
 [controller.soft]
 
@@ -465,21 +465,21 @@ def _predicted_lag(vehicle: Vehicle) -> tuple[str, str]:
     return "0.0", "the vehicle gives no lag"
 
 
-def _why_tilt(tuning: Design) -> str:
+def _why_tilt(design: Design) -> str:
     """Where the tilt bound is from, as a comment."""
-    if tuning.tilt_stated:
+    if design.tilt_stated:
         return "as --tilt states it"
-    held = math.degrees(math.acos(min(1.0, 1.0 / (THRUST_SHARE * tuning.authority.thrust_to_weight))))
+    held = math.degrees(math.acos(min(1.0, 1.0 / (THRUST_SHARE * design.authority.thrust_to_weight))))
     return f"the limit of the linear model, or {held:.3g} deg, what {100 * THRUST_SHARE:g} % of the thrust holds"
 
 
-def _robust(vehicle: Vehicle, tuning: Design) -> str:
-    place, height, heading = (in_digits(weight) for weight in tuning.weights)
-    speed = in_digits(tuning.speed_weight)
-    w = tuning.bandwidth
-    tilt = _tilt(tuning)
+def _robust(vehicle: Vehicle, design: Design) -> str:
+    place, height, heading = (in_digits(weight) for weight in design.weights)
+    speed = in_digits(design.speed_weight)
+    w = design.bandwidth
+    tilt = _tilt(design)
     why = f"1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8"
-    move = in_digits(tuning.move_weight)
+    move = in_digits(design.move_weight)
     why_move = f"as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
     moment = ""
     if vehicle.turned_by_air >= TURNED_FROM:
@@ -492,7 +492,7 @@ def _robust(vehicle: Vehicle, tuning: Design) -> str:
     lag, known = _predicted_lag(vehicle)
     return f"""[controller]
 type = "robust"
-horizon = {tuning.horizon}  # N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / w:.3g} s
+horizon = {design.horizon}  # N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / w:.3g} s
 rotor_lag = {lag}  # {known}
 {moment}heading = true  # the hover model is turned by the present yaw
 move_weight = {move}  # of changes: {why_move}
@@ -504,37 +504,37 @@ linear = {in_digits(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times t
 quadratic = {in_digits(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
 
 [controller.output_weights]
-x = {place}  # 1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers
+x = {place}  # 1 / (g tan(tilt bound) / w^2)^2: {design.deviation:.3g} m is what the tilt bound answers
 y = {place}  # as x
-z = {height}  # for {tuning.height:.3g} rad/s, at most {HEIGHT_RATIO:g} w; \
+z = {height}  # for {design.height:.3g} rad/s, at most {HEIGHT_RATIO:g} w; \
 all thrust in reserve answers {HEIGHT_STEP:g} m or more
-yaw = {heading}  # for {tuning.heading:.3g} rad/s, at most {HEADING_RATIO:g} w; \
+yaw = {heading}  # for {design.heading:.3g} rad/s, at most {HEADING_RATIO:g} w; \
 all torque in reserve answers {math.degrees(HEADING_STEP):.3g} deg or more
 
 [controller.input_weights]
 speed = {speed}  # {why}
 
 [controller.output_bounds]
-roll = {[-tilt, tilt]}  # deg: {_why_tilt(tuning)}
+roll = {[-tilt, tilt]}  # deg: {_why_tilt(design)}
 pitch = {[-tilt, tilt]}  # as roll
 """
 
 
-def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
+def _baseline(law: str, vehicle: Vehicle, design: Design, course: FirstCourse) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
-    steepest = BASELINE_SHARE * _tilt(tuning)
-    w = tuning.bandwidth
+    steepest = BASELINE_SHARE * _tilt(design)
+    w = design.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
     text = f"""[controller]
 type = {_text(law)}{rules if law == "lqr" else ""}
 tilt = {tilt}  # deg, largest that it commands; below the audit's, which it overshoots
-horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for the reference's velocity: \
+horizon = {math.ceil(PREVIEW / (w * design.period))}  # periods of preview for the reference's velocity: \
 {PREVIEW:g} / w = {PREVIEW / w:.3g} s
 """
     turned = vehicle.turned_by_air >= TURNED_FROM
     observed = law == "geometric" and turned and not course.lasts
     if law != "lqr":
-        lag = lag_to_allow_for(vehicle, tuning.period)
+        lag = lag_to_allow_for(vehicle, design.period)
         share = OBSERVED_LAG_SHARE if observed else LAG_SHARE
         text += f"lag = {in_digits(share * lag)}  # s that its gains allow for: {share:g} times "
         text += f"{1e3 * lag:.3g} ms, the rotors' lag or half a period\n"
@@ -561,9 +561,9 @@ def _turns_in_air(vehicle: Vehicle) -> bool:
     return any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
 
 
-def _constraints(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
+def _constraints(law: str, vehicle: Vehicle, design: Design, course: FirstCourse) -> str:
     """Return the audited constraints that are not bounds of the controller."""
-    tilt = _tilt(tuning)
+    tilt = _tilt(design)
     off = in_digits(course.allowed)
 
     def entry(name: str, signal: str, lower: float, upper: float | None, why: str) -> str:
@@ -597,18 +597,18 @@ def _height(vehicle: Vehicle, allowed: float) -> float:
     return max(LOWEST, math.ceil(10.0 * (lowest_centre(vehicle) + HEIGHT_OVER_ERROR * allowed) - 1e-6) / 10.0)
 
 
-def _tilt(tuning: Design) -> float:
+def _tilt(design: Design) -> float:
     """The tilt bound [deg], by rule a whole number where it is above 5."""
-    degrees = math.degrees(tuning.tilt) + 1e-9
-    if tuning.tilt_stated:
+    degrees = math.degrees(design.tilt) + 1e-9
+    if design.tilt_stated:
         return round(degrees, 6)
     if degrees > 5.0:
         return float(math.floor(degrees))
     return in_digits(degrees)
 
 
-def _slew(tuning: Design) -> tuple[float, float]:
-    return in_digits(tuning.slew[0], 4), in_digits(tuning.slew[1], 4)
+def _slew(design: Design) -> tuple[float, float]:
+    return in_digits(design.slew[0], 4), in_digits(design.slew[1], 4)
 
 
 def later(time: float) -> float:

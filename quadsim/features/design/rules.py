@@ -1,25 +1,8 @@
-"""Controller parameters from a vehicle's parameters: bandwidths, and the weights that give them.
+"""Controller parameters from a vehicle's parameters: the bandwidth w of x and y, and the weights that give it.
 
-1. *Bandwidth.*  From rotor speeds to a place there are four integrators.  The optimum of q x^2 + r u^2 on them is a
-   Butterworth pattern of radius w (Anderson and Moore, "Optimal Control", 1990, Sec. 5.4), with
-   w^8 = (g beta)^2 q / r and beta the angular acceleration per rotor speed; of two integrators, w^4 = beta^2 q / r.
-   w is the smallest of
-   - 1 / (`LAG_RATIO` (T + tau / 2)), T the rotors' time constant and tau the period: the loop then stands about
-     0.8 (T + tau / 2) more delay than it knows of (`delay_margin`; the tests measure it);
-   - 0.5 sqrt(alpha / tilt), alpha the angular acceleration in reserve: the largest tilt is reached and left within
-     2 sqrt(tilt / alpha) = 1 / w;
-   - `FASTEST_LOOP`, so that a period of 10 ms or more is enough.
-2. *Period*: the longest with tau w <= `PERIOD_SHARE`, 40 samples in each period of the loop's own motion (Astroem and
-   Wittenmark, "Computer-Controlled Systems", 1997, recommend 15 to 60).
-3. *Horizon*: `HORIZON_TIMES` / w, in which the loop's own motion has died out.
-4. *Weights* by Bryson's rule, 1 / (largest accepted deviation)^2 (Bryson and Ho, "Applied Optimal Control", 1975): the
-   place deviates by what the tilt bound itself would answer, g tan(tilt) / w^2; the rotor speed's weight follows from
-   w by 1., those of height and heading likewise from theirs.  Changes of rotor speeds cost as much as the speeds
-   themselves at `MOVE_RATIO` w.
-5. *Level speed*: that at which a tilt grows by Munk's moment at the rate w.  A pole p > 0 requires a bandwidth above
-   p M / (M - 1), M the peak of the complementary sensitivity (Skogestad and Postlethwaite, "Multivariable Feedback
-   Control", 2005, Sec. 5.9): w = p is where no peak is large enough; at 60 % of that speed M is 2.5 or more.  Without
-   lag the Butterworth pattern itself is stable up to p = 2^(1/4) w (Hurwitz).
+w = min(1 / (`LAG_RATIO` (T + tau / 2)), 0.5 sqrt(alpha / tilt), `FASTEST_LOOP`), with lag T, period tau, angular
+acceleration alpha in reserve (`authority.py`); speed_weight = x_weight (g beta)^2 / w^8, beta the angular acceleration
+per rotor speed.  Each function states its rule and its source.  `first_scenario.py` writes the result as a file.
 """
 
 from __future__ import annotations
@@ -32,7 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from quadsim.errors import ParameterError
-from quadsim.features.design.authority import Authority, authority
+from quadsim.features.design.authority import Authority, control_authority
 from quadsim.mpc.problem.model import continuous_model, discretise
 from quadsim.state import INDEX, Array
 from quadsim.ties import TIE_SHARE, first_smallest
@@ -56,22 +39,24 @@ HEADING_RATIO: Final = 0.7  # bandwidth of the heading over that of the place
 HEADING_STEP: Final = 0.5  # deviation of the heading that the whole torque in reserve answers [rad]
 LEAST_RESERVE: Final = 1e-6
 """Smallest reserve of acceleration [m/s^2] and angular acceleration [rad/s^2] for which a design exists."""
-LONGEST: Final = 2.0  # delays beyond are not looked for [s]
+LONGEST: Final = 2.0  # longest delay that `delay_margin` tries [s]
 _HALVINGS: Final = 14
+LimitedBy = Literal["lag", "torque", "period"]
+"""What limits the bandwidth: the rotors' lag, the torque in reserve, or the shortest period."""
 MOVE_RATIO: Final = 4.0  # frequency at which changes of rotor speeds cost as much as these, over w
 
 
 @dataclass(frozen=True, kw_only=True)
 class Design:
-    """Numbers of `[controller] type = "robust"` for a vehicle."""
+    """A linear MPC for a vehicle: the numbers of `[controller] type = "robust"`."""
 
-    authority: Authority  # what they follow from
+    authority: Authority  # of the vehicle, from which they follow
     period: float  # tau [s]
     horizon: int  # N [periods]
     tilt: float  # bound on roll and on pitch [rad]
-    tilt_stated: bool  # whether somebody gave it; else it is by rule
+    tilt_stated: bool  # whether it was stated; otherwise it is by rule
     bandwidth: float  # w of x and y [rad/s]
-    limited_by: Literal["lag", "torque", "period"]  # what w is the limit of
+    limited_by: LimitedBy  # what keeps w from being larger
     height: float  # bandwidth of z [rad/s]
     heading: float  # bandwidth of yaw [rad/s]
     deviation: float  # accepted of x and y [m]
@@ -88,33 +73,41 @@ class Design:
 
 
 def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
-    """The numbers for a vehicle; see the module.  A tilt bound [deg] replaces that of the rules.
+    """Return the numbers for a vehicle.
+
+    Horizon: `HORIZON_TIMES` / w, in which the loop's own motion has died out.  Changes of rotor speeds cost as much as
+    the speeds themselves at `MOVE_RATIO` w.
+
+    Level speed: that at which a tilt grows by Munk's moment at the rate w.  A pole p > 0 requires a bandwidth above
+    p M / (M - 1), M the peak of the complementary sensitivity (Skogestad and Postlethwaite, "Multivariable Feedback
+    Control", 2005, Sec. 5.9): w = p is where no peak is large enough; at 60 % of that speed M is 2.5 or more.  Without
+    lag the Butterworth pattern itself is stable up to p = 2^(1/4) w (Hurwitz).
+
+    Args:
+        vehicle: its parameters.
+        tilt: tilt bound [deg] that replaces that of the rules.
 
     Raises:
         ParameterError: hover leaves no thrust or no torque in reserve, or the rotors do not carry the weight at this
             tilt.
     """
-    can = authority(vehicle)
-    if min(can.climb, can.sink, *can.turning) < LEAST_RESERVE:
-        rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
-        side = ("speed_max", "speed_min")[first_smallest([can.climb, can.sink], TIE_SHARE * vehicle.gravity)]
-        raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
+    authority = control_authority(vehicle)
+    _require_reserves(vehicle, authority)
     if tilt is None:
-        bound = _tilt_bound(can)
+        bound = _tilt_bound(authority)
     else:
-        bound = _stated_tilt(can, tilt)
-    bandwidth, limited_by, period = _bandwidth(can, bound)
-    height = min(HEIGHT_RATIO * bandwidth, math.sqrt(min(can.climb, can.sink) / HEIGHT_STEP))
-    heading = min(HEADING_RATIO * bandwidth, math.sqrt(can.turning[2] / HEADING_STEP))
-    _, B = continuous_model(vehicle)
-    lift, roll, pitch, yaw = (
-        float(np.linalg.norm(B[INDEX[name]])) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
-    )
+        bound = _stated_tilt(authority, tilt)
+    bandwidth, limited_by, period = _bandwidth(authority, bound)
+    height = min(HEIGHT_RATIO * bandwidth, math.sqrt(min(authority.climb, authority.sink) / HEIGHT_STEP))
+    heading = min(HEADING_RATIO * bandwidth, math.sqrt(authority.turning[2] / HEADING_STEP))
     deviation = vehicle.gravity * math.tan(bound) / bandwidth**2
-    place = deviation**-2.0
-    speed = place * (vehicle.gravity * min(roll, pitch)) ** 2 / bandwidth**8
+    weights, speed_weight = _weights(vehicle, deviation, bandwidth, height, heading)
+    if authority.munk:
+        fastest = bandwidth / authority.munk
+    else:
+        fastest = math.inf
     return Design(
-        authority=can,
+        authority=authority,
         period=period,
         horizon=math.ceil(HORIZON_TIMES / (bandwidth * period)),
         tilt=bound,
@@ -124,26 +117,71 @@ def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
         height=height,
         heading=heading,
         deviation=deviation,
-        weights=(place, speed * height**4 / lift**2, speed * heading**4 / yaw**2),
-        speed_weight=speed,
-        move_weight=speed / (MOVE_RATIO * bandwidth * period) ** 2,
-        slew=(
-            -(float(vehicle.hover_speeds.min()) - vehicle.speed_min) * _reached(period, vehicle.rotor_fall),
-            (vehicle.speed_max - float(vehicle.hover_speeds.max())) * _reached(period, vehicle.rotor_rise),
-        ),
-        fastest=bandwidth / can.munk if can.munk else math.inf,
+        weights=weights,
+        speed_weight=speed_weight,
+        move_weight=speed_weight / (MOVE_RATIO * bandwidth * period) ** 2,
+        slew=_slew(vehicle, period),
+        fastest=fastest,
     )
 
 
-def _tilt_bound(can: Authority) -> float:
-    """The tilt bound [rad] by rule; a vehicle that barely hovers keeps a third of the tilt that it can hold."""
-    held = math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight)))
-    return max(min(STEEPEST, held), can.steady_tilt / 3.0)
+def _require_reserves(vehicle: Vehicle, authority: Authority) -> None:
+    """Refuse a vehicle whose hover leaves no thrust or no torque to control it with."""
+    if min(authority.climb, authority.sink, *authority.turning) >= LEAST_RESERVE:
+        return
+    smaller = first_smallest([authority.climb, authority.sink], TIE_SHARE * vehicle.gravity)
+    side = ("speed_max", "speed_min")[smaller]
+    rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
+    raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
 
 
-def _stated_tilt(can: Authority, tilt: float) -> float:
-    """A tilt bound [deg] in radians, if the vehicle can hold it."""
-    steady = math.degrees(can.steady_tilt)
+def _weights(
+    vehicle: Vehicle, deviation: float, bandwidth: float, height: float, heading: float
+) -> tuple[tuple[float, float, float], float]:
+    """Return the weights of position, height and heading, and that of a rotor's speed [s^2/rad^2].
+
+    Bryson's rule, 1 / (largest accepted deviation)^2 (Bryson and Ho, "Applied Optimal Control", 1975): the position
+    deviates by what the tilt bound itself would answer, g tan(tilt) / w^2.
+
+    From rotor speeds to x there are four integrators.  The optimum of q x^2 + r u^2 on them is a Butterworth pattern
+    of radius w (Anderson and Moore, "Optimal Control", 1990, Sec. 5.4), with w^8 = (g beta)^2 q / r and beta the
+    angular acceleration per rotor speed; of two integrators, w^4 = beta^2 q / r.
+
+    Args:
+        vehicle: its model at hover.
+        deviation: accepted of x and y [m].
+        bandwidth: of x and y [rad/s].
+        height: bandwidth of z [rad/s].
+        heading: bandwidth of yaw [rad/s].
+    """
+    _, B = continuous_model(vehicle)
+    lift = float(np.linalg.norm(B[INDEX["vz"]]))
+    roll = float(np.linalg.norm(B[INDEX["roll_rate"]]))
+    pitch = float(np.linalg.norm(B[INDEX["pitch_rate"]]))
+    yaw = float(np.linalg.norm(B[INDEX["yaw_rate"]]))
+    position_weight = deviation**-2.0
+    speed_weight = position_weight * (vehicle.gravity * min(roll, pitch)) ** 2 / bandwidth**8
+    height_weight = speed_weight * height**4 / lift**2
+    heading_weight = speed_weight * heading**4 / yaw**2
+    return (position_weight, height_weight, heading_weight), speed_weight
+
+
+def _slew(vehicle: Vehicle, period: float) -> tuple[float, float]:
+    """Return the largest steps of a rotor's command from hover, down and up [rad/s]: what it reaches in a period."""
+    below = float(vehicle.hover_speeds.min()) - vehicle.speed_min
+    above = vehicle.speed_max - float(vehicle.hover_speeds.max())
+    return -below * _reached(period, vehicle.rotor_fall), above * _reached(period, vehicle.rotor_rise)
+
+
+def _tilt_bound(authority: Authority) -> float:
+    """Return the tilt bound [rad] by rule; a vehicle that barely hovers keeps a third of the tilt that it can hold."""
+    held = math.acos(min(1.0, 1.0 / (THRUST_SHARE * authority.thrust_to_weight)))
+    return max(min(STEEPEST, held), authority.steady_tilt / 3.0)
+
+
+def _stated_tilt(authority: Authority, tilt: float) -> float:
+    """Return a stated tilt bound [deg] in radians, if the vehicle can hold it."""
+    steady = math.degrees(authority.steady_tilt)
     if not LEAST_TILT <= tilt <= min(steady, LARGEST_TILT):
         if steady < LARGEST_TILT:
             most = f"{steady:.3g}, up to where the rotors carry the weight"
@@ -153,12 +191,23 @@ def _stated_tilt(can: Authority, tilt: float) -> float:
     return math.radians(tilt)
 
 
-def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torque", "period"], float]:
-    """The bandwidth w [rad/s], what limits it, and the period [s]."""
+def _bandwidth(authority: Authority, tilt: float) -> tuple[float, LimitedBy, float]:
+    """Return the bandwidth w [rad/s], what limits it, and the period tau [s].
+
+    w is the smallest of
+    - 1 / (`LAG_RATIO` (T + tau / 2)), T the rotors' time constant: the loop then tolerates about 0.8 (T + tau / 2) of
+      delay beyond the modelled one (`delay_margin`; the tests measure it);
+    - 0.5 sqrt(alpha / tilt), alpha the angular acceleration in reserve: the largest tilt is reached and left within
+      2 sqrt(tilt / alpha) = 1 / w;
+    - `FASTEST_LOOP`, so that a period of 10 ms or more is enough.
+
+    The period is the longest with w tau <= `PERIOD_SHARE`, 40 samples in each period of the loop's own motion (Astroem
+    and Wittenmark, "Computer-Controlled Systems", 1997, recommend 15 to 60).
+    """
     for period in PERIODS:
-        limits: dict[Literal["lag", "torque", "period"], float] = {
-            "lag": 1.0 / (LAG_RATIO * (can.lag + 0.5 * period)),
-            "torque": 0.5 * math.sqrt(min(can.turning[:2]) / tilt),
+        limits: dict[LimitedBy, float] = {
+            "lag": 1.0 / (LAG_RATIO * (authority.lag + 0.5 * period)),
+            "torque": 0.5 * math.sqrt(min(authority.turning[:2]) / tilt),
             "period": FASTEST_LOOP,
         }
         bandwidth = min(limits.values())
@@ -169,25 +218,26 @@ def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torq
 
 
 def _reached(period: float, lag: float | None) -> float:
-    """Share of a step that a rotor's speed makes in a period."""
+    """Return the share of a step that a rotor's speed makes in a period, 1 - exp(-tau / T)."""
     if lag is None:
         return 1.0
     return 1.0 - math.exp(-period / lag)
 
 
-def gain(vehicle: Vehicle, tuning: Design) -> Array:
-    """K (4, n + 4) of u = -K [x; u(k-1)], deviations from hover: the weights' optimum over an infinite horizon.
+def gain(vehicle: Vehicle, design: Design) -> Array:
+    """Return K (4, n + 4) of u = -K [x; u(k-1)], deviations from hover: the weights' optimum over an infinite horizon.
 
     Changes of inputs are part of the cost, so the last input is a state; n is 12, or 16 with rotors that lag.
     """
-    A, B = discretise(*continuous_model(vehicle, vehicle.rotor_rise or 0.0), tuning.period)
+    A_c, B_c = continuous_model(vehicle, vehicle.rotor_rise or 0.0)
+    A, B = discretise(A_c, B_c, design.period)
     n = len(A)
     Q = np.zeros((n, n))
-    place, height, heading = tuning.weights
-    for name, weight in (("x", place), ("y", place), ("z", height), ("yaw", heading)):
+    position, height, heading = design.weights
+    for name, weight in (("x", position), ("y", position), ("z", height), ("yaw", heading)):
         Q[INDEX[name], INDEX[name]] = weight
-    D = tuning.move_weight * np.eye(N_ROTORS)
-    R = tuning.speed_weight * np.eye(N_ROTORS)
+    D = design.move_weight * np.eye(N_ROTORS)
+    R = design.speed_weight * np.eye(N_ROTORS)
     A = scipy.linalg.block_diag(A, np.zeros((N_ROTORS, N_ROTORS)))
     B = np.vstack([B, np.eye(N_ROTORS)])
     cross = np.vstack([np.zeros((n, N_ROTORS)), -D])
@@ -195,44 +245,45 @@ def gain(vehicle: Vehicle, tuning: Design) -> Array:
     return np.asarray(np.linalg.solve(R + D + B.T @ P @ B, B.T @ P @ A + cross.T))
 
 
-def is_stable(vehicle: Vehicle, tuning: Design, K: Array, delay: float) -> bool:
-    """Whether the loop of a gain is stable where commands act some time [s] later than it knows of."""
+def is_stable(vehicle: Vehicle, design: Design, K: Array, delay: float) -> bool:
+    """Return whether the loop of a gain is stable with a delay [s] of the commands beyond the modelled one."""
     A_c, B_c = continuous_model(vehicle, vehicle.rotor_rise or 0.0)
     n = len(A_c)
-    period = tuning.period
-    whole = int(delay / period + 1e-9)
-    late = max(delay - whole * period, 0.0)
+    period = design.period
+    whole_periods = int(delay / period + 1e-9)
+    remainder = max(delay - whole_periods * period, 0.0)
     A, _ = discretise(A_c, B_c, period)
-    rest, newer = discretise(A_c, B_c, period - late)
-    older = rest @ discretise(A_c, B_c, late)[1]
-    # States: x, u(k-1) .. u(k-whole-1); u(k-whole-1) acts until `late`, then u(k-whole).
-    size = n + N_ROTORS * (whole + 1)
+    A_rest, B_newer = discretise(A_c, B_c, period - remainder)
+    _, B_start = discretise(A_c, B_c, remainder)
+    B_older = A_rest @ B_start
+    # States: x, u(k-1) .. u(k-m-1), m the whole periods; u(k-m-1) acts during the remainder, then u(k-m).
+    size = n + N_ROTORS * (whole_periods + 1)
     closed = np.zeros((size, size))
     entry = np.zeros((size, N_ROTORS))
     closed[:n, :n] = A
-    closed[:n, size - N_ROTORS :] = older
-    if whole == 0:
-        entry[:n] = newer
+    closed[:n, size - N_ROTORS :] = B_older
+    if whole_periods == 0:
+        entry[:n] = B_newer
     else:
-        closed[:n, size - 2 * N_ROTORS : size - N_ROTORS] += newer
+        closed[:n, size - 2 * N_ROTORS : size - N_ROTORS] += B_newer
     entry[n : n + N_ROTORS] = np.eye(N_ROTORS)
-    closed[n + N_ROTORS :, n : size - N_ROTORS] = np.eye(N_ROTORS * whole)
+    closed[n + N_ROTORS :, n : size - N_ROTORS] = np.eye(N_ROTORS * whole_periods)
     closed[:, : n + N_ROTORS] -= entry @ K
     return float(np.abs(np.linalg.eigvals(closed)).max()) < 1.0
 
 
-def delay_margin(vehicle: Vehicle, tuning: Design) -> float:
-    """Shortest delay [s] beyond what the model knows of at which the loop is no longer stable, to a thousandth."""
-    K = gain(vehicle, tuning)
+def delay_margin(vehicle: Vehicle, design: Design) -> float:
+    """Return the longest delay [s] beyond the modelled one with which the loop is stable, by bisection."""
+    K = gain(vehicle, design)
     low = 0.0
     high = 1e-3
-    while high < LONGEST and is_stable(vehicle, tuning, K, high):
+    while high < LONGEST and is_stable(vehicle, design, K, high):
         low = high
         high = 1.5 * high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        if is_stable(vehicle, tuning, K, middle):
-            low, high = (middle, high)
+        if is_stable(vehicle, design, K, middle):
+            low = middle
         else:
-            low, high = (low, middle)
+            high = middle
     return low

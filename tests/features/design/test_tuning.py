@@ -11,7 +11,7 @@ from first_flights import vehicles
 
 from quadsim.controller import StepInputs
 from quadsim.errors import ParameterError
-from quadsim.features.design.authority import authority
+from quadsim.features.design.authority import control_authority
 from quadsim.features.design.first_scenario import SHARE, first_scenario, largest_eight
 from quadsim.features.design.rules import FASTEST_LOOP, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
 from quadsim.mpc.laws.parts.builders import build
@@ -89,7 +89,7 @@ def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
 def test_a_tilt_grows_in_the_air_by_munks_moment() -> None:
     """In a level glide at 8 m/s, rotors at hover: the plant's own pitch, against exp(p t) + exp(-p t) over 2."""
     vehicle = next(each for each in ALL if each.name == "random-16")
-    rate, tilt = 8.0 * authority(vehicle).munk, 1e-3
+    rate, tilt = 8.0 * control_authority(vehicle).munk, 1e-3
     with Plant(vehicle, effects=Effects(air=Air(body_drag=vehicle.body_drag))) as plant:
         start = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
         start[INDEX["vx"]] = 8.0
@@ -110,7 +110,7 @@ def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle
         assert ends == ("speed" if vehicle.name == "random-16" else "tilt")
         if ends == "speed":
             assert speed == pytest.approx(SHARE * tuning.fastest, rel=0.01)
-    assert authority(next(each for each in ALL if each.name == "lopes2011")).munk == 0.0
+    assert control_authority(next(each for each in ALL if each.name == "lopes2011")).munk == 0.0
 
 
 def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
