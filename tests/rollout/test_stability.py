@@ -27,7 +27,6 @@ from quadsim.state import INDEX, Array
 
 WITHIN = 0.02
 """How far from a margin a pair of flights tells on which side it is, as a share: that of the bisection."""
-LAWS = ("paper-unconstrained", "paper-constrained", "lqr")
 
 
 @cache
@@ -167,7 +166,10 @@ MARGINS = [
     ("lqr", "lag"),
     ("paper-unconstrained", "thrust"),
 ]
-SLOW_MARGINS = [(law, quantity) for law in LAWS if law != "lqr" for quantity in ("heading", "delay", "lag")]
+SLOW_MARGINS = []
+for slower in ("paper-unconstrained", "paper-constrained"):
+    for margin in ("heading", "delay", "lag"):
+        SLOW_MARGINS.append(pytest.param(slower, margin, marks=pytest.mark.slow("stability")))
 
 
 @pytest.mark.parametrize(

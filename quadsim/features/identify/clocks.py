@@ -22,7 +22,7 @@ REFUSED_SHIFT: Final = {"rates are": 0.015, "velocity is": 0.05}
 """Shift [s] that is refused: drag and yaw reaction would be wrong, and their intervals with them."""
 NOTED_SHIFT: Final = 5e-3  # [s]
 # The rates' shift counts only where they follow the attitude at all.
-LEAST_CORRELATION: Final = 0.7
+LEAST_SIMILARITY: Final = 0.7
 # Of the velocity's change, tilt and thrust must leave less than this share unexplained at the best shift,
 MOST_UNEXPLAINED: Final = 0.7
 # and without a shift, more by this factor and this share: below, the peak is noise.
@@ -40,7 +40,7 @@ def check_clocks(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
     tick = stride(record.period) * record.period
     turns = turning_pairs(record, parts)
     correlation = np.array([total_correlation(turns, shift) for shift in ticks])
-    if correlation.max() > LEAST_CORRELATION:
+    if correlation.max() > LEAST_SIMILARITY:
         yield from _note(record.name, "rates are", _peak(correlation) * tick)
     motion = lateral_motion(record, parts)
     explained = np.array([tilt_fit(motion, shift=shift)[0] for shift in ticks])

@@ -18,7 +18,7 @@ from quadsim.state import EULER, POSITION, Array, tilt
 from quadsim.ties import in_order
 from quadsim.vehicle import Vehicle
 
-Rows = np.ndarray[Any, np.dtype[np.intp]]
+Indices = np.ndarray[Any, np.dtype[np.intp]]
 _CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
 _LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis
 _TOLERANCE: Final = 0.03  # how far a drawn path may be from the real one, in arm lengths
@@ -122,7 +122,7 @@ class Footage:
     """A flight at F frame times."""
 
     times: Array  # (F,) [s]
-    period: Rows  # (F,) index of the control period each frame is in
+    period: Indices  # (F,) index of the control period each frame is in
     position: Array  # (F, 3) [m], world
     euler: Array  # (F, 3) roll, pitch, yaw [rad], of the plant row before the frame
     quaternion: Array  # (F, 4) attitude, scalar first
@@ -183,7 +183,7 @@ def make_footage(run: Filmed, times: Array) -> Footage:
     )
 
 
-def _attitude_between(attitudes: Array, before: Rows, after: Rows, share: Array) -> Array:
+def _attitude_between(attitudes: Array, before: Indices, after: Indices, share: Array) -> Array:
     """Quaternions (F, 4) at a share (F, 1) of the way from rows to others, by the shorter turn."""
     start = attitudes[before]
     end = attitudes[after]
@@ -201,7 +201,7 @@ def _camera_aim(run: Filmed, times: Array, position: Array) -> Array:
     return position + np.clip(smooth - position, -leash, leash)
 
 
-def _row_before(t: Array, times: Array) -> Rows:
+def _row_before(t: Array, times: Array) -> Indices:
     """The last row of increasing instants t at each of the times."""
     return np.clip(np.searchsorted(t, times + 1e-9, side="right") - 1, 0, t.size - 1)
 
@@ -244,7 +244,7 @@ def _smooth(t: Array, values: Array) -> Array:
     return values
 
 
-def thin(points: Array, tolerance: float) -> Rows:
+def thin(points: Array, tolerance: float) -> Indices:
     """Rows of a path (n, 3) that show it within `tolerance` [m], first and last included (Ramer-Douglas-Peucker)."""
     thinned = {0, len(points) - 1}
     open_spans = [(0, len(points) - 1)]

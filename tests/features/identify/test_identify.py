@@ -204,10 +204,10 @@ def test_a_throttle_offset_is_where_the_speeds_begin(offset: float) -> None:
     throttle, level = np.stack([u] * 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (11, 1))
     record = Record(name="a", t=0.01 * np.arange(11), attitude=level, throttle=throttle, **columns)
     line = start.speed_max * np.maximum((throttle - offset) / (1.0 - offset), 0.0)
-    np.testing.assert_allclose(commanded(record, start, Parameters.of(start)), line, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(demanded_speeds(record, start, Parameters.of(start)), line, rtol=1e-12, atol=1e-9)
     top = start.mean_coefficient * start.speed_max**2
     mapped, v = altered(start, {"thrust_of_throttle": (0.4 * top, 0.6 * top)}), line / start.speed_max
-    speeds = commanded(record, mapped, Parameters.of(mapped))
+    speeds = demanded_speeds(record, mapped, Parameters.of(mapped))
     np.testing.assert_allclose(mapped.thrusts(speeds), top * (0.4 * v + 0.6 * v**2), rtol=1e-12, atol=1e-9)
 
 
