@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from hypothesis import settings
 from numpy_preparation import NonlinearModel, next_state
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
-from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
@@ -37,24 +35,14 @@ from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.rollout import many
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.many import Row
-from quadsim.rollout.rollout import closed_loop
 from quadsim.rotation import conjugate, multiply
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
-from quadsim.scenarios.schema.scenario import Scenario
-from quadsim.sim.loop import complete
-from quadsim.sim.navigation import Navigation
-from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, N_STATES, Array
+from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 NO_PRODUCTS = {"video": False, "recording": False, "figures": False}
 """Of a flight that is saved."""
-
-
-def fewer(share: float) -> settings:
-    """Settings for a property whose examples are dear: a share of as many as the profile draws."""
-    return settings(max_examples=round(share * settings.default.max_examples))
 
 
 def fly_here(patch: pytest.MonkeyPatch) -> None:
@@ -352,40 +340,6 @@ def small_log(periods: int = 4, *, steps: int = 5, seed: int = 0, reason: str | 
         predicted=rng.normal(size=(periods, 6, 3)).astype(np.float32) if periods else None,
         reason=reason,
     )
-
-
-def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float]) -> FlightLog:
-    """A made-up flight where one state is as given, in its own unit, and all else is zero.
-
-    One sample per 0.1 s; plant rows spread evenly, the first at t = 0, the last at the end of the last period.
-    """
-    steps, rest = divmod(len(plant) - 1, len(samples))
-    assert rest == 0, "plant rows must be a whole number per period, plus one"
-    log = small_log(len(samples), steps=steps)
-    control = replace(
-        log.control,
-        state=(state := np.zeros_like(log.control.state)),
-        truth=state,
-        reference=np.zeros_like(log.control.reference),
-    )
-    flown = replace(log.plant, state=np.zeros_like(log.plant.state))
-    control.state[:, INDEX[state_name]] = samples
-    flown.state[:, INDEX[state_name]] = plant
-    return replace(log, control=control, plant=flown)
-
-
-def fly_once(
-    scenario: Scenario,
-    plant: Plant,
-    controller: Controller,
-    reference: Array,
-    *,
-    navigation: Navigation | None,
-) -> FlightLog:
-    """Fly a scenario with a plant and a controller that were built for it; no set-points, no other controllers."""
-    loop = closed_loop(Assembly(scenario), plant, controller, reference, navigation=navigation)
-    complete(loop, periods=scenario.periods)
-    return loop.log()
 
 
 def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:

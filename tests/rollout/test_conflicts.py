@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import ocp_peer
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
-from support import changing_period, fewer, random_problem, with_terms
+from support import changing_period, random_problem, with_terms
 
 from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
@@ -19,6 +19,11 @@ from quadsim.rollout.conflicts import Conflict, Side, find_conflict, has_answer,
 TERMS = ((), ("constraints",), ("margins", "constraints"), ("soft",), ("soft", "margins", "constraints", "P", "Q_d"))
 NEAR = 1e-4
 """Violation, as a share, that is too little for an independent solver to be sure of."""
+
+
+def fewer(share: float) -> settings:
+    """Settings for a property whose examples take long: a share of as many as the profile draws."""
+    return settings(max_examples=round(share * settings.default.max_examples))
 
 
 def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> InfeasiblePeriod:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from numpy_preparation import next_state, nonlinear_model
-from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc, robust_table
+from support import derivative, paper_problem, paper_reference, robust_mpc, robust_table
 
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
@@ -32,8 +32,10 @@ from quadsim.mpc.problem.tightening import (
     margins,
 )
 from quadsim.mpc.tables.commands import InputWeights
+from quadsim.rollout.rollout import closed_loop
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
+from quadsim.sim.loop import complete
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -317,9 +319,12 @@ def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float
     scenario = load_scenario("paper-constrained", ["duration=13.5", *sets])
     drawn_in = tilt_margins(vehicle, rotor_lag=rotor_lag, estimated=True) if tight else None
     controller = robust(vehicle, drawn_in, rotor_lag=rotor_lag)
-    reference = Assembly(scenario).reference(scenario.periods + HORIZON)
-    with Assembly(scenario).plant() as plant:
-        log = fly_once(scenario, plant, controller, reference, navigation=None)
+    assembly = Assembly(scenario)
+    reference = assembly.reference(scenario.periods + HORIZON)
+    with assembly.plant() as plant:
+        loop = closed_loop(assembly, plant, controller, reference, navigation=None)
+        complete(loop, periods=scenario.periods)
+        log = loop.log()
     assert log.reason is None
     assert len(log.plant.t) > 13_499  # each physics step
     tilts = np.abs(log.plant.state[:, [INDEX["roll"], INDEX["pitch"]]])
