@@ -339,14 +339,14 @@ def test_a_comparison_says_first_in_which_fields_the_controllers_differ(tmp_path
     free = quadsim.load("paper-unconstrained", brief)
     bounded = quadsim.load("paper-constrained", brief)
     flown = quadsim.fly(bounded, progress=False)
-    (note,) = quadsim.compare(quadsim.fly(free, progress=False), flown, progress=False).notes
+    note = quadsim.compare(quadsim.fly(free, progress=False), flown, progress=False).notes[0]
     for words in ("type (unconstrained, constrained)", "horizon (100, 50)", "input_weights", "output_bounds"):
         assert words in note
     page = quadsim.compare(free, bounded, out=tmp_path / "page", video=False, progress=False).page
     opening = page.read_text(encoding="utf-8").partition("</h1>")[2].partition("<h2")[0]
     assert note in opening
     assert quadsim.compare(flown, bounded.replace({"seed": 3}), progress=False).notes == ()
-    (note,) = quadsim.compare(flown, bounded.replace({"controller.horizon": 60}), progress=False).notes
+    note = quadsim.compare(flown, bounded.replace({"controller.horizon": 60}), progress=False).notes[0]
     assert note.endswith(": differ in horizon (50, 60).")
 
 
