@@ -197,7 +197,7 @@ def test_what_the_rotors_can_do_is_the_bound_of_audit_notes_and_feasibility() ->
     assert assembly.bounds["speed"] == (0.0, 200.0)
     assert [(limit.lower, limit.upper) for limit in assembly.limits if limit.signal == "speed"] == [(0.0, 200.0)]
     (note,) = hover_notes(assembly)
-    assert note == "hover needs 202.2 rad/s, the bound is 200: no controller can hold altitude"
+    assert note.startswith("hover needs 202.2 rad/s, the bound is 200")
 
 
 def test_a_difference_is_noted_from_when_it_is_there() -> None:

@@ -254,7 +254,7 @@ def test_throttle_alone_shows_thrust_only_for_the_highest_speed_as_kept() -> Non
     assert len(wrong(found, throttle_curve=0.7)) <= 1  # of 17 intervals of 95 %
     known = by_name(found)
     for name in ("thrust_coefficient", "rotor_inertia", "rotor_drag"):
-        assert known[name].refused == "a log of the throttle shows it only for the highest speed of 1089.4 rad/s, kept"
+        assert "1089.4 rad/s" in known[name].refused
     assert "voltage_exponent" not in known
     full = found.vehicle.thrust_coefficient * start.speed_max**2
     assert full == pytest.approx(TRUE.thrust_coefficient * START.speed_max**2, rel=0.15)
@@ -309,7 +309,8 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     series = {name: Column(t=record.t, values=np.asarray(getattr(record, name))) for name in fields}
     read = to_record("imu", series | {"specific_force": Column(t=record.t, values=force)})
     assert read.inertial
-    assert read.notes == ("imu: no velocity is logged; the accelerometer stands in for it",)
+    (note,) = read.notes
+    assert note.startswith("imu: no velocity is logged")
     found = identify(read)
     moments = {f"{name}_{axis}": v for name, of in MOMENTS.items() for axis, v in zip("xyz", of, strict=False)}
     assert not wrong(found, **moments, inflow=INFLOW)

@@ -176,7 +176,7 @@ def test_a_law_that_raises_is_said_and_has_no_margins(hummingbird: Scenario) -> 
     found = quadsim.stability(hummingbird, controller=scaled_laws.RaisesLater, over=["delay"], progress=False)
     growth = found.loops[0].growth
     assert growth.verdict == "unstable"
-    assert growth.ended == "at t = 1.000 s: the controller raised RuntimeError: no answer for this"
+    assert growth.ended.endswith("RuntimeError: no answer for this")
     assert found.loops[0].margins == {}
     assert growth.ended in found.text()
 

@@ -163,7 +163,7 @@ def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: 
 
 def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> None:
     flight = Rollout(load_scenario(written(HOVER.replace("self.speeds\n", "self.speeds * np.nan\n")))).fly()
-    assert flight.log.reason == "at t = 0.000 s: the command is not finite: [nan, nan, nan, nan]"
+    assert "not finite: [nan, nan, nan, nan]" in flight.log.reason
 
 
 class Answers:
