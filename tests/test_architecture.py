@@ -444,7 +444,8 @@ def removals(source: str) -> Iterator[str]:
     """Calls that remove or replace files, of `os`, `shutil` and `pathlib`; `text.replace` has two arguments."""
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            name, owner = node.func.attr, ast.unparse(node.func.value)
+            name = node.func.attr
+            owner = ast.unparse(node.func.value)
             if name == "replace":
                 removes = (len(node.args) == 1 or owner == "os") and owner not in ("dataclasses", "scenario")
             else:

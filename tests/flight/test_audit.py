@@ -184,7 +184,8 @@ def test_steps_of_the_command_are_audited_from_the_first_on() -> None:
 
 def test_the_worst_finding_is_a_required_one_unless_none_is() -> None:
     log = logged("z", samples=SAMPLES, plant=PLANT)
-    tight, roomy = replace(Z, name="tight", required=False), replace(Z, name="roomy", lower=-9.0, upper=9.0)
+    tight = replace(Z, name="tight", required=False)
+    roomy = replace(Z, name="roomy", lower=-9.0, upper=9.0)
     assert worst_finding(audit(log, (tight, roomy))) == find(log, roomy)
     assert worst_finding(audit(log, (tight, replace(roomy, required=False)))) == find(log, tight)
 

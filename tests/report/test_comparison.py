@@ -293,7 +293,9 @@ def test_a_verdict_is_compared_with_the_one_the_scenario_states(
 
 def test_a_verdict_minds_required_constraints_and_whether_they_were_reached(bare_run: Flight) -> None:
     finding = bare_run.findings[0]
-    missed, held, broken = unreached(finding, "arrival"), with_margin(finding, 1.0), with_margin(finding, -1.0)
+    missed = unreached(finding, "arrival")
+    held = with_margin(finding, 1.0)
+    broken = with_margin(finding, -1.0)
     reported = dataclasses.replace(missed, limit=dataclasses.replace(missed.limit, required=False))
     result = {
         "incomplete": [held, missed],

@@ -158,7 +158,8 @@ def test_a_required_constraint_that_the_flight_does_not_reach_makes_it_incomplet
 
 
 def test_the_command_line_tells_incomplete_from_violated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, verdicts = tmp_path / "scenario.toml", tmp_path / "verdicts.xml"
+    path = tmp_path / "scenario.toml"
+    verdicts = tmp_path / "verdicts.xml"
     path.write_text(incomplete().to_toml())
     quiet = ["--out", str(tmp_path / "run"), "--no-video", "--no-recording", "--no-figures"]
     assert main(["run", str(path), *quiet]) == EXIT_DONE

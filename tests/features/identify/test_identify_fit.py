@@ -298,9 +298,11 @@ def test_throttle_and_speeds_give_the_rotors_answer_and_then_the_forces() -> Non
 def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     """Its noise is that of a cheap one."""
     flight = flown(air=True)
-    record, log = record_of(flight), flight.log
+    record = record_of(flight)
+    log = flight.log
     stride = (len(log.plant.t) - 1) // len(log.control.t)
-    state, step = log.plant.state, log.plant.t[1] - log.plant.t[0]
+    state = log.plant.state
+    step = log.plant.t[1] - log.plant.t[0]
     change = np.gradient(state[:, VELOCITIES], step, axis=0)[:-1:stride]
     change[:, 2] += TRUE.gravity
     force = to_world(conjugate(euler_to_quaternion(state[:-1:stride, ANGLES])), change)

@@ -134,7 +134,9 @@ def test_a_law_of_ones_own_has_the_margin_of_its_gain(hummingbird: Scenario) -> 
     law = functools.partial(scaled_laws.ScaledGain, factor=3.0)
     found = quadsim.stability(hummingbird, controller=law, over=["thrust"], progress=False).loops[0]
     built = scaled_laws.ScaledGain(Assembly(hummingbird).vehicle, hummingbird.control_period, 1, factor=3.0)
-    A, B, K = built.model.A, built.model.B, built.gain
+    A = built.model.A
+    B = built.model.B
+    K = built.gain
 
     def radius(thrust: float) -> float:
         return float(np.abs(np.linalg.eigvals(A - math.sqrt(thrust) * B @ K)).max())

@@ -67,7 +67,8 @@ def test_with_velocities_a_cubic_is_met_exactly() -> None:
         return np.stack([np.polynomial.Polynomial(column).deriv(order)(times) for column in cubic.T], axis=1)
 
     table = Table(t=t, poses=np.column_stack([at(t), t]), velocities=at(t, 1), sha256="")
-    path, since = through_rows(table), np.linspace(0.0, 2.2, 50)
+    path = through_rows(table)
+    since = np.linspace(0.0, 2.2, 50)
     np.testing.assert_allclose(path.pose(since)[:, :3], at(2.0 + since), atol=1e-12)
     np.testing.assert_allclose(path.pose(since)[:, 3], 2.0 + since)
 
@@ -78,7 +79,8 @@ def test_yaw_that_wraps_is_unwrapped(tmp_path: Path) -> None:
 
 
 T = np.arange(0.0, 6.05, 0.1)
-RADIUS, RATE = 2.0, 0.5
+RADIUS = 2.0
+RATE = 0.5
 """A circle, [m] and [rad/s]: 1 m/s."""
 
 

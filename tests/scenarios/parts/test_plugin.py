@@ -39,7 +39,8 @@ Write = Callable[..., str]
 @pytest.fixture
 def written(tmp_path: Path) -> Iterator[Write]:
     """Writes a module under a name that nothing else has, and a scenario beside it; gives the scenario's path."""
-    before, count = set(sys.modules), itertools.count()
+    before = set(sys.modules)
+    count = itertools.count()
 
     def write(code: str, controller: str = 'controller = "{module}:Hover"', *, module: str | None = None) -> str:
         name = module or f"custom_{abs(hash(str(tmp_path)))}_{next(count)}"
@@ -170,7 +171,9 @@ class Answers:
     """A law that overwrites its input and its answer, and returns a command changed in one part."""
 
     def __init__(self, **changes: Any) -> None:
-        self._speeds, self._plan, self._changes = np.full(4, 190.0), np.full((3, 4), 190.0), changes
+        self._speeds = np.full(4, 190.0)
+        self._plan = np.full((3, 4), 190.0)
+        self._changes = changes
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         assert now.acting is not None
