@@ -177,7 +177,8 @@ def fly_known(fly_once: Fly) -> Fly:
     """Stands in for `Rollout.fly`: a scenario as the library has it is flown once per session."""
 
     def fly(rollout: Rollout, progress: Progress = silent) -> Flight:
-        scenario, substituted = rollout.scenario, rollout._events._build is None
+        scenario = rollout.scenario
+        substituted = rollout._events._build is None
         if not substituted and scenario.name in scenario_names() and load_scenario(scenario.name) == scenario:
             return fly_once(scenario.name)
         return _fly(rollout, progress)

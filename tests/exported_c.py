@@ -51,13 +51,15 @@ class Host:
     """One controller of a compiled library."""
 
     def __init__(self, scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> None:
-        source, right = c_controller(scenario, precision, rows), ctypes.c_int()
+        source = c_controller(scenario, precision, rows)
+        right = ctypes.c_int()
         self.library = library(tuple(source.files.items()), source.defines)
         self.library.host_size.restype = ctypes.c_size_t
         self.memory = np.zeros(self.library.host_size(ctypes.byref(right)) // 8 + 1)
         assert right.value, "the memory that the export states is not what the controller needs"
         self.rows, width, _ = source.reference
-        self.horizon, self.state = source.horizon, source.state
+        self.horizon = source.horizon
+        self.state = source.state
         self.inputs = np.zeros(self.state + 5 + self.rows * width)
         self.answers = np.zeros(7 + 8 * self.horizon)
 
@@ -68,7 +70,9 @@ class Host:
         """Of a state (12,) that is to be longer, the rest is not measured."""
         at = self.state
         self.inputs[:at] = np.nan
-        self.inputs[: len(state)], self.inputs[at : at + 4], self.inputs[at + 5 :] = state, acting, reference.ravel()
+        self.inputs[: len(state)] = state
+        self.inputs[at : at + 4] = acting
+        self.inputs[at + 5 :] = reference.ravel()
         self.inputs[at + 4] = PHASES.index(phase)
         self._call(self.library.host_step, self.inputs, self.answers)
         result = self.answers.copy()

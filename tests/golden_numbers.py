@@ -67,7 +67,8 @@ def library_entry(flight: Flight) -> dict[str, Any]:
         "flown": round(log.control.t.size * flight.scenario.control_period, 6),
     }
     if flight.outcome != "lost":
-        rmse, result = tracking(log.control)["rmse"], worst_finding(flight.findings)
+        rmse = tracking(log.control)["rmse"]
+        result = worst_finding(flight.findings)
         entry["rmse"] = [round(rmse[axis], 4) for axis in "xyz"]
         entry["tilt"] = round(peak_tilt(log.plant.state), 2)
         entry["qps"] = round(100.0 * log.control.status.count(SOLVED) / log.control.t.size, 1) if flight.solver else 0
@@ -80,7 +81,8 @@ def library_entry(flight: Flight) -> dict[str, Any]:
 
 def paper_entry(flight: Flight) -> dict[str, Any]:
     """Tracking [m, deg], the margins that decide, and the commands of one of the paper's flights [rad/s]."""
-    summary, control = summarise(flight), flight.log.control
+    summary = summarise(flight)
+    control = flight.log.control
     rmse = summary["tracking"]["rmse"]
     return {
         "rmse": [round(rmse[axis], 5) for axis in "xyz"] + [round(math.degrees(rmse["yaw"]), 4)],

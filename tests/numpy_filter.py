@@ -135,23 +135,28 @@ def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, dura
     h = duration
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
     attitude = (qw, qx, qy, qz)
-    J, J_inverse = model.inertia, np.linalg.inv(model.inertia)
+    J = model.inertia
+    J_inverse = np.linalg.inv(model.inertia)
     v_x, v_y, v_z = Rotation.from_quat(attitude, scalar_first=True).inv().apply([vx, vy, vz])
     m_x, m_y = driven.turning * np.array(model.moment) - v_z * np.array(model.inflow)
     across = np.array([m_x * v_y, -m_y * v_x, 0.0])
     arms = model.allocation / model.allocation[0]  # (4, 4): 1, y, -x, reaction of each rotor's thrust
     lost = arms @ (model.lost * driven.speeds * (v_z + p * arms[1] + q * arms[2]))
-    a, across = driven.acceleration - lost[0] / model.mass, across - lost[1:]
+    a = driven.acceleration - lost[0] / model.mass
+    across = across - lost[1:]
 
     def turned(rates: Array) -> Array:
         return J_inverse @ (driven.torque + across - model.damping @ rates - np.cross(rates, J @ rates))
 
-    half, rates = 0.5 * h, np.array([p, q, r])
+    half = 0.5 * h
+    rates = np.array([p, q, r])
     halfway = rates + half * turned(rates)
     p1, q1, r1 = halfway.tolist()
     quarter = 0.25 * h  # the mean rate of the first half, times its length
     w, x, y, z = multiply(attitude, exponential((quarter * (p + p1), quarter * (q + q1), quarter * (r + r1))))
-    ax, ay, az = 2.0 * a * (x * z + w * y), 2.0 * a * (y * z - w * x), a * (1.0 - 2.0 * (x * x + y * y)) - model.gravity
+    ax = 2.0 * a * (x * z + w * y)
+    ay = 2.0 * a * (y * z - w * x)
+    az = a * (1.0 - 2.0 * (x * x + y * y)) - model.gravity
     mean = np.array(
         [
             px + h * (vx + half * ax),
@@ -201,11 +206,15 @@ def _gathered(density: Array) -> tuple[Array, Array, Array]:
     return read_only(density), read_only(0.5 * (N @ density + density @ N.T)), read_only(N @ density @ N.T / 3.0)
 
 
-_RETAINED, _VARIANCE, _WALK = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
+_RETAINED = np.ones(N_ERRORS)
+_VARIANCE = np.zeros(N_ERRORS)
+_WALK = np.zeros(N_ERRORS)
 """1 for entries without velocity or rates, else 0; the variance of velocity and rates; the growth of the rest."""
 _RETAINED[VELOCITY_PART] = _RETAINED[RATES_PART] = 0.0
-_VARIANCE[VELOCITY_PART], _VARIANCE[RATES_PART] = STILL_VELOCITY**2, STILL_RATE**2
-_WALK[POSITION_PART], _WALK[ATTITUDE_PART] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
+_VARIANCE[VELOCITY_PART] = STILL_VELOCITY**2
+_VARIANCE[RATES_PART] = STILL_RATE**2
+_WALK[POSITION_PART] = STILL_TIME * STILL_VELOCITY**2
+_WALK[ATTITUDE_PART] = STILL_TIME * STILL_RATE**2
 
 
 def lifts(model: MotionModel, driven: Drive) -> bool:
@@ -266,7 +275,8 @@ def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, 
     2]x of Solà 2017, Eq.  (287), which would rotate the covariance by half the correction and is neglected there, too.
     `variance` (3, 3) is R, of the sensor's noise.
     """
-    H, P = OBSERVATION[name], estimate.covariance
+    H = OBSERVATION[name]
+    P = estimate.covariance
     residual = innovation(name, estimate.mean, value)
     rows = H @ P
     weight = _inverse(rows @ H.T + variance)
@@ -297,7 +307,11 @@ def inflate(estimate: Estimate, name: SensorName, value: Array, refused: float) 
 def _inverse(S: Array) -> Array:
     """The inverse of a symmetric positive definite (3, 3) matrix by its cofactors: faster than a call of LAPACK."""
     (a, b, c), (_, d, e), (_, _, f) = S.tolist()
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    A = d * f - e * e
+    B = c * e - b * f
+    C = b * e - c * d
     scale = 1.0 / (a * A + b * B + c * C)
-    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    D = a * f - c * c
+    E = b * c - a * e
+    F = a * d - b * b
     return scale * np.array([[A, B, C], [B, D, E], [C, E, F]])

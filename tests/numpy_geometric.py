@@ -152,11 +152,17 @@ class NumpyGeometric:
     """The equations of `quadsim.mpc.laws.geometric.GeometricController`."""
 
     def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
-        self.commands, self._vehicle, self._period = settings.commands, vehicle, period
+        self.commands = settings.commands
+        self._vehicle = vehicle
+        self._period = period
         self.gains = gains = geometric_gains(vehicle, period, settings)
-        self._feedforward, self._drag, self._moment = settings.feedforward, np.array(settings.drag), settings.moment
+        self._feedforward = settings.feedforward
+        self._drag = np.array(settings.drag)
+        self._moment = settings.moment
         self._turning = float(vehicle.hover_speeds.sum())
-        self._largest_tilt, lags, half = math.radians(settings.tilt), settings.inner_lag or NO_LAG, 0.5 * period
+        self._largest_tilt = math.radians(settings.tilt)
+        lags = settings.inner_lag or NO_LAG
+        half = 0.5 * period
         self._ahead = half + (lags[0] if settings.commands != ROTORS else 0.0)
         self._lead = np.array(lags[1:]) + (half if settings.feedforward else 0.0)
         self.k_R = gains.k_R * np.array([1.0, 1.0, YAW_SHARE**2])
@@ -165,15 +171,19 @@ class NumpyGeometric:
     def wrench(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
-        J, R, Omega = self._vehicle.momentum, motion.attitude, motion.rates
+        J = self._vehicle.momentum
+        R = motion.attitude
+        Omega = motion.rates
         thrust, desired = self._force(motion, target, integrals, disturbance)
-        e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
+        e_R = attitude_error(R, desired.attitude)
+        e_Omega = rate_error(R, Omega, desired.attitude, desired.rates)
         R_rel = R.T @ desired.attitude
         ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
         moment = np.cross(Omega, J(Omega)) - J(self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         if self._moment:
             turning = self._turning * math.sqrt(max(thrust, 0.0) / (self._vehicle.mass * self._vehicle.gravity))
-            velocity, rates = R.T @ target.velocity, R_rel @ desired.rates
+            velocity = R.T @ target.velocity
+            rates = R_rel @ desired.rates
             moment -= self._vehicle.air_moment(turning, velocity, rates)
             moment += self._vehicle.lost_to_inflow(self._vehicle.hover_speeds, np.zeros(3), rates)[1:]
             thrust += (self._vehicle.inflow or 0.0) * turning * float(velocity[2])
@@ -182,7 +192,8 @@ class NumpyGeometric:
     def targets(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
-        R, Omega = motion.attitude, motion.rates
+        R = motion.attitude
+        Omega = motion.rates
         thrust, desired = self._force(motion, target, integrals, disturbance)
         R_rel = R.T @ desired.attitude
         Omega_d = R_rel @ desired.rates
@@ -199,9 +210,13 @@ class NumpyGeometric:
     def _force(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance
     ) -> tuple[float, DesiredAttitude]:
-        gains, m, gravity = self.gains, self._vehicle.mass, self._vehicle.gravity
-        R, Omega = motion.attitude, motion.rates
-        e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
+        gains = self.gains
+        m = self._vehicle.mass
+        gravity = self._vehicle.gravity
+        R = motion.attitude
+        Omega = motion.rates
+        e_x = motion.position - target.position
+        e_v = motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
         demanded = m * (-gains.k_x * e_x - gains.k_v * e_v - integrals.translation + weight + target.acceleration)
         demanded -= m * disturbance[0]
@@ -209,7 +224,8 @@ class NumpyGeometric:
         A1 = A2 = p1 = p2 = np.zeros(3)
         if np.array_equal(A, demanded):
             A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
-            p1, p2 = m * target.acceleration, m * target.jerk
+            p1 = m * target.acceleration
+            p2 = m * target.jerk
         desired = desired_attitude(
             (A, A1, A2),
             (m * target.velocity, p1, p2),
@@ -219,12 +235,15 @@ class NumpyGeometric:
         if not self._feedforward:
             return float(A @ R[:, 2]), desired
         up = R[:, 2] + self._ahead * R @ np.array([Omega[1], -Omega[0], 0.0])
-        along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
+        along = A + m * self._drag[2] * target.velocity
+        along1 = A1 + self._drag[2] * p1
         return float((along + self._ahead * along1) @ up), desired
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
-        gains, period = self.gains, self._period
-        e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
+        gains = self.gains
+        period = self._period
+        e_x = motion.position - target.position
+        e_v = motion.velocity - target.velocity
         e_R = attitude_error(motion.attitude, desired.attitude)
         e_Omega = rate_error(motion.attitude, motion.rates, desired.attitude, desired.rates)
         translation = integrals.translation + period * gains.k_i * (e_v + gains.c_1 * e_x)
@@ -237,9 +256,15 @@ class NumpyGeometric:
     def _force_derivatives(
         self, motion: Measured, target: Target, A: Array, e_v: Array, disturbance: ForeseenDisturbance
     ) -> tuple[Array, Array]:
-        m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.gains.k_x, self.gains.k_v
+        m = self._vehicle.mass
+        R = motion.attitude
+        Omega = motion.rates
+        k_x = self.gains.k_x
+        k_v = self.gains.k_v
         disturbing, change, _ = disturbance
-        up, up1 = R[:, 2], R @ np.array([Omega[1], -Omega[0], 0.0])  # R e_3 and its derivative, R hat(Omega) e_3
+        # R e_3 and its derivative, R hat(Omega) e_3
+        up = R[:, 2]
+        up1 = R @ np.array([Omega[1], -Omega[0], 0.0])
         v_b = R.T @ motion.velocity
         v_d = R.T @ target.velocity
         f = max(float(A @ up) + m * self._drag[2] * v_d[2], 0.0)

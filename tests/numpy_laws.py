@@ -22,8 +22,10 @@ LOWEST_RATIO = 0.5  # height in radii below which the ground effect grows no fur
 def respond(rotors: RotorDynamics, speeds: Array, target: Array, elapsed: Array) -> tuple[Array, Array]:
     """Speeds (M, 4) and accelerations (M, 4) of rotors at times (M,) after a command: a line, then an exponential."""
     gap = target - speeds
-    sign, distance = np.sign(gap), np.abs(gap)
-    lag, steepest = np.where(gap >= 0.0, rotors.rise or 0.0, rotors.fall or 0.0), rotors.acceleration or math.inf
+    sign = np.sign(gap)
+    distance = np.abs(gap)
+    lag = np.where(gap >= 0.0, rotors.rise or 0.0, rotors.fall or 0.0)
+    steepest = rotors.acceleration or math.inf
     eased = distance if math.isinf(steepest) else np.minimum(distance, steepest * lag)
     ramp_end = (distance - eased) / steepest  # the slope is limited until then; 0 without a limit
     t = elapsed[:, None]
@@ -63,7 +65,8 @@ def thrust_ratio(height: float, radius: float) -> float:
 
 def rotor_drag(vehicle: Vehicle, coefficient: float, speeds: Array, turn: Rotation, air: Array, rates: Array) -> Array:
     """F_i = -k w_i v_i in each rotor's plane, v_i the air's speed at its hub: force, world, and torque, body (6,)."""
-    force, torque = np.zeros(3), np.zeros(3)
+    force = np.zeros(3)
+    torque = np.zeros(3)
     for place, speed in zip(vehicle.hubs, speeds, strict=True):
         at_hub = turn.inv().apply(air) + np.cross(rates, place)
         pull = -coefficient * speed * at_hub * [1.0, 1.0, 0.0]
@@ -94,7 +97,8 @@ def inflow(vehicle: Vehicle, coefficient: float, speeds: Array, turn: Rotation, 
 
     Force, world, and torque, body (6,): of arm times thrust, and of the reaction that follows the thrust.
     """
-    force, torque = np.zeros(3), np.zeros(3)
+    force = np.zeros(3)
+    torque = np.zeros(3)
     for place, speed, spin in zip(vehicle.hubs, speeds, vehicle.rotor_spins, strict=True):
         at_hub = turn.inv().apply(air) + np.cross(rates, place)
         lost = np.array([0.0, 0.0, coefficient * speed * at_hub[2]])
@@ -118,7 +122,8 @@ def ground_effect(
     vehicle: Vehicle, radius: float, thrusts: Array, turn: Rotation, height: float, floor: float, disc: float
 ) -> Array:
     """What the rotors' thrusts gain near the ground: force, world, and torque, body (6,)."""
-    force, torque = 0.0, np.zeros(3)
+    force = 0.0
+    torque = np.zeros(3)
     for place, thrust in zip(vehicle.hubs, thrusts, strict=True):
         above = height - floor + turn.apply(place + np.array([0.0, 0.0, disc]))[2]
         gain = thrust * (thrust_ratio(above, radius) - 1.0)
@@ -135,8 +140,10 @@ def mix(vehicle: Vehicle, settings: AutopilotSettings, thrust: float, torque: Ar
         vehicle.coefficients * speed**2 / lift for speed in (settings.idle * vehicle.speed_max, vehicle.speed_max)
     )
     to_thrusts = np.linalg.inv(vehicle.allocation / vehicle.coefficients) / lift[:, None]
-    level, yaw = to_thrusts[:, 1:3] @ torque[:2], to_thrusts[:, 3] * torque[2]
-    base, airmode = min(max(0.25 * thrust, low.max()), high.min()), settings.airmode
+    level = to_thrusts[:, 1:3] @ torque[:2]
+    yaw = to_thrusts[:, 3] * torque[2]
+    base = min(max(0.25 * thrust, low.max()), high.min())
+    airmode = settings.airmode
     signs = np.concatenate([np.eye(4), -np.eye(4)])
     differences = np.eye(4)[:, None] - np.eye(4)
     rows = differences.reshape(16, 4) if airmode else signs
@@ -167,19 +174,23 @@ class NumpyAutopilot:
     """The equations of `quadsim.sim.autopilot`."""
 
     def __init__(self, vehicle: Vehicle, settings: AutopilotSettings) -> None:
-        self.vehicle, self.settings = vehicle, settings.resolved(vehicle)
+        self.vehicle = vehicle
+        self.settings = settings.resolved(vehicle)
         assert self.settings.rate is not None
         assert self.settings.delay is not None
         self.step = 1.0 / self.settings.rate
         hover = vehicle.hover_speeds
-        self.integral, self.filtered, self.slope = np.zeros(3), np.zeros(3), np.zeros(3)
+        self.integral = np.zeros(3)
+        self.filtered = np.zeros(3)
+        self.slope = np.zeros(3)
         self.queue = deque([hover] * round(self.settings.delay * self.settings.rate))
 
     def _share(self, cutoff: float | None) -> float:
         return 1.0 - math.exp(-math.tau * cutoff * self.step) if cutoff else 1.0
 
     def speeds(self, target: Array, rates: Array, attitude: Array) -> Array:
-        s, J = self.settings, self.vehicle.inertia_matrix
+        s = self.settings
+        J = self.vehicle.inertia_matrix
         assert s.largest_rate is not None
         demanded = target[1:4]
         if target.size > 4:

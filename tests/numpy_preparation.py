@@ -80,9 +80,16 @@ def slopes(model: NonlinearModel, x: Array, speeds: Array) -> Array:
     roll, pitch, yaw = x[6:11:2].tolist()
     dr, dp, dy = x[7:12:2].tolist()
     thrust, *torque = (model.effectiveness @ speeds**2).tolist()
-    sr, sp, sy = math.sin(roll), math.sin(pitch), math.sin(yaw)
-    cr, cp, cy = math.cos(roll), math.cos(pitch), math.cos(yaw)
-    p, q, r = dr - sp * dy, cr * dp + cp * sr * dy, cp * cr * dy - sr * dp  # omega = E d(eta)/dt
+    sr = math.sin(roll)
+    sp = math.sin(pitch)
+    sy = math.sin(yaw)
+    cr = math.cos(roll)
+    cp = math.cos(pitch)
+    cy = math.cos(yaw)
+    # omega = E d(eta)/dt
+    p = dr - sp * dy
+    q = cr * dp + cp * sr * dy
+    r = cp * cr * dy - sr * dp
     if model.air is not None:
         velocity = body_to_world(x[[*EULER]]).T @ x[[*VELOCITY]]
         added = air_on(model.air, speeds, velocity, np.array([p, q, r]))
@@ -104,7 +111,9 @@ def slopes(model: NonlinearModel, x: Array, speeds: Array) -> Array:
 
 def next_state(model: NonlinearModel, x: Array, u: Array) -> Array:
     """The state (n,) one period after a state x (n,) under inputs u (4,), by Runge-Kutta's classical method."""
-    step, state, rotors = model.period / model.substeps, x[:N_STATES], x[N_STATES:]
+    step = model.period / model.substeps
+    state = x[:N_STATES]
+    rotors = x[N_STATES:]
     for k in range(model.substeps):
         start, middle, end = (spun(model, rotors, u, (k + share) * step) for share in (0.0, 0.5, 1.0))
         k_1 = slopes(model, state, start)
@@ -145,13 +154,15 @@ class NumpyPreparation:
 
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
         period = problem.model.period
-        self.problem, self.settings = problem, settings
+        self.problem = problem
+        self.settings = settings
         model = nonlinear_model(vehicle, period, rotor_lag=resolved_lag(settings.rotor_lag, vehicle) or None)
         self.model = replace(model, air=vehicle if settings.moment else None)
         self.whole, self.late = split_delay(settings.delay, period)
         self.from_accelerations = np.linalg.inv(slope(hover_model(vehicle, period)))
         self.observer = DisturbanceObserver(settings.offset_free, period) if settings.offset_free else None
-        self.turns, self.estimate = ReferenceTurns(), np.zeros(6)
+        self.turns = ReferenceTurns()
+        self.estimate = np.zeros(6)
         self.sent = deque([vehicle.hover_speeds] * (self.whole + 1), maxlen=self.whole + 1)
         self.rotors = vehicle.hover_speeds  # when the next command takes over in this period
         self.ahead: Array | None = None  # the state there
@@ -185,11 +196,14 @@ class NumpyPreparation:
     def stand(self, acting: Array) -> None:
         """Pass a period on the ground."""
         self.follow(acting)
-        self.estimate, self.ahead = np.zeros(6), None
+        self.estimate = np.zeros(6)
+        self.ahead = None
 
     def prepare(self, state: Array, reference: Array, acting: Array, *, flying: bool, learns: bool) -> Query:
         """The query of a period in the air, or on the ground before it."""
-        period, before, ahead = self.model.period, self.rotors, self.ahead
+        period = self.model.period
+        before = self.rotors
+        ahead = self.ahead
         in_force, under_way, rotors = self.follow(acting)
         if self.observer is not None and ahead is not None and learns:
             missed = surprise(state, self.after(period - self.late, ahead, before, in_force))
@@ -206,7 +220,9 @@ class NumpyPreparation:
     def query(self, x: Array, turning: Array, reference: Array, acting: Array) -> Query:
         """The query from a state (12,) and rotor speeds (4,) at the instant from which the command acts."""
         beyond = self.beyond_hover(x, turning)
-        n, trim, yaw = self.problem.model.n, self.trim, float(x[YAW]) if self.settings.heading else 0.0
+        n = self.problem.model.n
+        trim = self.trim
+        yaw = float(x[YAW]) if self.settings.heading else 0.0
         rates = self.problem.rates(reference)
         reference = self.later(reference)
         rates = None if rates is None else self.later(rates)
@@ -216,7 +232,8 @@ class NumpyPreparation:
             reference[:, 3] = np.cumsum(np.clip(steps, -most, most))
             x = turn_horizontally(x, -yaw)
             x[YAW] = 0.0
-        c, s = math.cos(yaw), math.sin(yaw)
+        c = math.cos(yaw)
+        s = math.sin(yaw)
         for rows in (reference, rates):
             if rows is not None:
                 rows[:, :2] = rows[:, :2] @ np.array([[c, -s], [s, c]])
@@ -234,11 +251,15 @@ class NumpyPreparation:
         vehicle = self.model.air
         if vehicle is None:
             return np.zeros(4)
-        velocity, euler, euler_rates = x[[*VELOCITY]], x[[*EULER]], x[[*EULER_RATE]]
+        velocity = x[[*VELOCITY]]
+        euler = x[[*EULER]]
+        euler_rates = x[[*EULER_RATE]]
         along = body_to_world(euler).T @ velocity
         done = air_on(vehicle, turning, along, euler_to_body_rates(euler, euler_rates))
         level = body_to_world(np.array([0.0, 0.0, euler[2] if self.settings.heading else 0.0])).T @ velocity
-        across, climbing = np.array([*level[:2], 0.0]), np.array([0.0, 0.0, level[2]])  # to first order, each alone
+        # to first order, each alone
+        across = np.array([*level[:2], 0.0])
+        climbing = np.array([0.0, 0.0, level[2]])
         hover = vehicle.hover_speeds
         known = air_on(vehicle, hover, across, euler_rates) + air_on(vehicle, hover, climbing, np.zeros(3))
         return np.asarray(done - known)

@@ -33,14 +33,23 @@ class NumpyRamp:
         thrust_lag: float | None,
         acting: Array,
     ) -> None:
-        self.vehicle, self.period, self.drags, self.moment = vehicle, period, (drag, quadratic_drag), moment
-        self.targets, self.lag = thrust_lag is not None, (settings.rotor_lag if thrust_lag is None else thrust_lag) or 0
-        self.scaled, self.acting, self.last = settings.thrust_scale, acting, None
+        self.vehicle = vehicle
+        self.period = period
+        self.drags = (drag, quadratic_drag)
+        self.moment = moment
+        self.targets = thrust_lag is not None
+        self.lag = (settings.rotor_lag if thrust_lag is None else thrust_lag) or 0
+        self.scaled = settings.thrust_scale
+        self.acting = acting
+        self.last = None
         self.pole = np.exp(-np.repeat([FORCE_SHARE, TORQUE_SHARE], 3))
         self.largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
         self.largest[2] = LARGEST_CHANGE * vehicle.gravity if self.scaled else self.largest[2]
         self.decay = math.exp(-period / settings.drag_memory)
-        self.value, self.change, self.products, self.squares = np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(3)
+        self.value = np.zeros(6)
+        self.change = np.zeros(6)
+        self.products = np.zeros(3)
+        self.squares = np.zeros(3)
 
     @property
     def scale(self) -> float:
@@ -48,7 +57,8 @@ class NumpyRamp:
         return 1.0 + float(np.clip(ahead / self.vehicle.gravity, -LARGEST_CHANGE, LARGEST_CHANGE)) * bool(self.scaled)
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
-        value, change = self.value + (0.5 * self.period + ahead) * self.change, self.change[:3].copy()
+        value = self.value + (0.5 * self.period + ahead) * self.change
+        change = self.change[:3].copy()
         if self.scaled:
             value[2] = change[2] = 0.0
         return value[:3], change, value[3:]
@@ -79,19 +89,25 @@ class NumpyRamp:
         return -inertia * float(np.array(self.vehicle.rotor_spins) @ speeds) / self.period
 
     def update(self, follows: bool, v: Array, R: Array, Omega: Array, command: Array) -> None:
-        g, dt, J = self.vehicle.gravity, self.period, self.vehicle.inertia_matrix
+        g = self.vehicle.gravity
+        dt = self.period
+        J = self.vehicle.inertia_matrix
         thrust, *torque = self.wrench(command)
         v_b, (linear, square) = R.T @ v, self.drags
-        drag, axis, turning = -R @ ((linear + square * np.abs(v_b)) * v_b), R[:, 2], R @ np.cross(Omega, [0, 0, 1.0])
+        drag = -R @ ((linear + square * np.abs(v_b)) * v_b)
+        axis = R[:, 2]
+        turning = R @ np.cross(Omega, [0, 0, 1.0])
         momentum = J @ Omega + [0.0, 0.0, 0.0 if self.targets else dt * self.rotor_momentum(self.acting)]
         resisting = np.cross(Omega, momentum)
         if self.moment:
             resisting -= self.vehicle.air_moment(float(self.acting.sum()), v_b, Omega)
-            hover, still = self.vehicle.hover_speeds, np.zeros(3)
+            hover = self.vehicle.hover_speeds
+            still = np.zeros(3)
             damping = [self.vehicle.lost_to_inflow(hover, still, unit)[1:] for unit in np.eye(3)]
             resisting += np.diagonal(damping) * Omega
             drag -= axis * (self.vehicle.inflow or 0.0) * float(self.acting.sum()) * v_b[2] / self.vehicle.mass
-        last, self.last = self.last, (v, Omega, axis, turning, drag, resisting)
+        last = self.last
+        self.last = (v, Omega, axis, turning, drag, resisting)
         if last is None or not follows:
             return
         lift = thrust / self.vehicle.mass * (0.5 * (last[2] + axis) + dt / 12.0 * (last[3] - turning))
@@ -109,4 +125,5 @@ class NumpyRamp:
         self.change = (self.change + (1.0 - self.pole) ** 2 / dt * surprise) * (free == self.value)
         if not holds:
             d_b = R.T @ self.foreseen(0.0)[0] * [1.0, 1.0, not self.scaled]
-            self.products, self.squares = self.decay * self.products + d_b * v_b, self.decay * self.squares + v_b**2
+            self.products = self.decay * self.products + d_b * v_b
+            self.squares = self.decay * self.squares + v_b**2

@@ -87,7 +87,8 @@ def constraints(problem: Problem) -> tuple[Constraint, ...]:
 
 def values(constraint: Constraint, given: Period, plan: Array) -> Array:
     """(N, m) the values of a constraint's rows along the rolled out plan."""
-    states, steps = trajectory(given, plan), moves(given, plan)
+    states = trajectory(given, plan)
+    steps = moves(given, plan)
     result = np.zeros((*plan.shape[:-1], constraint.lower.shape[-1]))
     for row in range(result.shape[-1]):
         of_inputs = [
@@ -109,14 +110,16 @@ def violation(constraint: Constraint, given: Period, plan: Array) -> Array:
 
 def residuals(problem: Problem, given: Period, plan: Array) -> Array:
     """What the cost is the sum of the squares of, but for slacks."""
-    objective, states = problem.objective, trajectory(given, plan)
+    objective = problem.objective
+    states = trajectory(given, plan)
     errors = states[..., 1:, :] @ objective.C_r.T - given.desired
     summed = errors[..., : plan.shape[-2] - (objective.P is not None), :]
     parts = [(summed, objective.Q_y), (plan - given.equilibrium.u, objective.Q_u)]
     if objective.Q_d is not None:
         parts.append((moves(given, plan), objective.Q_d))
     if objective.P is not None:
-        x_s, inverse = given.equilibrium.x, np.linalg.pinv(objective.C_r)
+        x_s = given.equilibrium.x
+        inverse = np.linalg.pinv(objective.C_r)
         desired = x_s + inverse @ (given.desired[-1] - objective.C_r @ x_s)
         parts.append((states[..., -1:, :] - desired, objective.P))
     return np.concatenate([_flat(part @ _root(weight)) for part, weight in parts], axis=-1)
@@ -127,27 +130,35 @@ def cost(problem: Problem, given: Period, plan: Array) -> float:
     total = float(np.square(residuals(problem, given, plan)).sum())
     for constraint in constraints(problem):
         if constraint.penalty is not None:
-            e, penalty = violation(constraint, given, plan), constraint.penalty
-            l1, l2 = penalty.l1, penalty.l2
+            e = violation(constraint, given, plan)
+            penalty = constraint.penalty
+            l1 = penalty.l1
+            l2 = penalty.l2
             if penalty.largest:
-                e, l1, l2 = e.max(axis=1, keepdims=True), l1[:1], l2[:1]
+                e = e.max(axis=1, keepdims=True)
+                l1 = l1[:1]
+                l2 = l2[:1]
             total += float((e @ l1 + np.square(e) @ l2).sum())
     return total
 
 
 def dense_qp(problem: Problem, given: Period) -> QP:
     """In [u(k); ..; u(k+N-1); e], the slacks e time by time."""
-    N, nu = given.B.shape[0], given.B.shape[2]
+    N = given.B.shape[0]
+    nu = given.B.shape[2]
     M, r0 = _probed(lambda plan: residuals(problem, given, plan), N, nu)
     hard: list[tuple[Array, Array, Array]] = []
     soft: list[tuple[Array, Array, Array]] = []
-    l1, l2, shares = np.zeros((N, 0)), np.zeros((N, 0)), []
+    l1 = np.zeros((N, 0))
+    l2 = np.zeros((N, 0))
+    shares = []
     for part in constraints(problem):
         slopes, known = _probed(lambda plan, part=part: _flat(values(part, given, plan)), N, nu)  # type: ignore[misc]
         m = part.lower.shape[-1]
         lower, upper = (np.broadcast_to(side, (N, m)) for side in (part.lower, part.upper))
         bounded = (np.isfinite(lower) | np.isfinite(upper)).any(axis=0)
-        lower, upper = lower[:, bounded], upper[:, bounded]
+        lower = lower[:, bounded]
+        upper = upper[:, bounded]
         known = known.reshape(N, m)[:, bounded]
         rows = slopes.reshape(N, m, N * nu)[:, bounded], lower - known, upper - known
         (hard if part.penalty is None else soft).append(rows)
@@ -184,7 +195,8 @@ def least_violation(
     None where bounds on inputs cannot hold by themselves.  Of the bounds, by constraint, row and whether upper, those
     given alone are there, or all.
     """
-    N, nu = given.B.shape[0], given.B.shape[2]
+    N = given.B.shape[0]
+    nu = given.B.shape[2]
     rows: list[Array] = []
     bounds: list[Array] = []
     weights: list[Array] = []
@@ -236,7 +248,8 @@ def optimum(problem: Problem, given: Period) -> Optimum:
     exact = polish(qp, solution) if np.isfinite(solution.x).all() else solution
     if kkt_residuals(qp, exact).worst < kkt_residuals(qp, solution).worst:
         solution = exact
-    N, nu = given.B.shape[0], given.B.shape[2]
+    N = given.B.shape[0]
+    nu = given.B.shape[2]
     return Optimum(
         plan=solution.x[: N * nu].reshape(N, nu),
         slacks=solution.x[N * nu :].reshape(N, -1),

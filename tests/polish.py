@@ -45,10 +45,12 @@ def polish(qp: QP, solution: Solution) -> Solution:
         The solution with x and all multipliers replaced.  Of a poor start it may not be the optimum:
         `quadsim.mpc.problem.qp.kkt_residuals` shows.
     """
-    n, rows = qp.c.size, qp.h_l.size
+    n = qp.c.size
+    rows = qp.h_l.size
     P = _dense(qp.P)
     block = np.vstack([np.eye(n), _dense(qp.G), _dense(qp.A)])
-    lower, upper = np.concatenate([qp.x_l, qp.h_l, qp.b]), np.concatenate([qp.x_u, qp.h_u, qp.b])
+    lower = np.concatenate([qp.x_l, qp.h_l, qp.b])
+    upper = np.concatenate([qp.x_u, qp.h_u, qp.b])
     equal = np.flatnonzero(lower == upper)
     values = block @ solution.x
     multipliers = np.concatenate([solution.z_box, solution.z, solution.y])
@@ -59,7 +61,8 @@ def polish(qp: QP, solution: Solution) -> Solution:
         active = side.nonzero()[0]
         x, held = _solve_kkt(P, block[active], qp.c, np.where(side > 0, upper, lower)[active])
         values = block @ x
-        above, below = values - upper, lower - values
+        above = values - upper
+        below = lower - values
         against = np.maximum(above, below)
         against[active] = -held * side[active] / max(1.0, np.abs(held).max(initial=0.0))
         against[equal] = 0.0
@@ -89,7 +92,8 @@ def _worst(against: Array, among: Any) -> Any:
 
 def _solve_kkt(P: Array, M: Array, c: Array, d: Array) -> tuple[Array, Array]:
     """The optimum x and lambda; of the multipliers of dependent rows, the smallest."""
-    n, m = c.size, d.size
+    n = c.size
+    m = d.size
     system = np.block([[P, M.T], [M, np.zeros((m, m))]])
     right_side = np.concatenate([-c, d])
     try:

@@ -123,7 +123,8 @@ def failing(periods: Sequence[int], **answer: Any) -> dict[int, dict[str, Any] |
 
 def following(guarded: Pilot, periods: int) -> list[Command]:
     """Commands while the vehicle moves as the model predicts."""
-    state, commands = np.zeros(12), []
+    state = np.zeros(12)
+    commands = []
     for _ in range(periods):
         commands.append(call(guarded, state))
         state = advance(state, commands[-1].speeds)

@@ -40,7 +40,9 @@ def taken(sampler: Sampler, physics: Array) -> NDArray[np.void]:
             through = value.copy()
         value[[bool(fate & Fate.NO_NUMBER << axis) for axis in range(3)]] = np.nan
     samples = np.empty(len(steps), SAMPLE)
-    samples["taken"], samples["kind"], samples["value"] = steps, KINDS[sampler.name], values
+    samples["taken"] = steps
+    samples["kind"] = KINDS[sampler.name]
+    samples["value"] = values
     return samples[fates & Fate.LOST == 0]
 
 
@@ -51,5 +53,6 @@ def follow(navigation: Navigation, physics: Array, commands: Array, first: int, 
         motion = np.ascontiguousarray(row[1:])
         core_library().quadsim_sense(sensing, step, motion.ctypes.data)
     flown = np.zeros(len(physics), steps_type())
-    flown["physics"], flown["commands"] = physics, commands
+    flown["physics"] = physics
+    flown["commands"] = commands
     navigation.record(flown, on_ground=on_ground)

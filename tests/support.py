@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from hypothesis import settings
 from numpy_preparation import NonlinearModel, next_state
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
-from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
@@ -37,24 +35,14 @@ from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.rollout import many
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.many import Row
-from quadsim.rollout.rollout import closed_loop
 from quadsim.rotation import conjugate, multiply
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
-from quadsim.scenarios.schema.scenario import Scenario
-from quadsim.sim.loop import complete
-from quadsim.sim.navigation import Navigation
-from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, N_STATES, Array
+from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 NO_PRODUCTS = {"video": False, "recording": False, "figures": False}
 """Of a flight that is saved."""
-
-
-def fewer(share: float) -> settings:
-    """Settings for a property whose examples are dear: a share of as many as the profile draws."""
-    return settings(max_examples=round(share * settings.default.max_examples))
 
 
 def fly_here(patch: pytest.MonkeyPatch) -> None:
@@ -92,7 +80,7 @@ def judged_by(flight: Flight, *limits: Limit) -> Flight:
 
 
 def constrained_mpc(problem: Problem, solver: Solver | None = None) -> LinearMPC:
-    """The paper's law for a problem, by default with PIQP."""
+    """The paper's controller for a problem, by default with PIQP."""
     solver = solver or make_solver("piqp", problem)
     return LinearMPC(NominalPreparation(problem), solver, name="constrained", holds=True)
 
@@ -106,8 +94,9 @@ def robust_table(**fields: Any) -> Robust:
 
 
 def robust_mpc(vehicle: Vehicle, table: Robust, problem: Problem | None = None, solver: str = "piqp") -> LinearMPC:
-    """The robust law of a table, with another problem where one is given; its period is the paper's."""
-    problem = table.problem(vehicle, 0.05) if problem is None else problem
+    """The robust controller of a table, with another problem where one is given; its period is the paper's."""
+    if problem is None:
+        problem = table.problem(vehicle, 0.05)
     return LinearMPC(RobustPreparation(vehicle, problem, table), make_solver(solver, problem), name="robust")
 
 
@@ -123,7 +112,7 @@ def paper_reference(samples: int) -> Array:
 
 
 def random_problem(rng: np.random.Generator, *, horizon: int, n: int = 3, nu: int = 2, n_c: int = 1) -> Problem:
-    """A stable system with random weights and bounds; the state order is nobody's."""
+    """A stable system with random weights and bounds; its states have no meaning."""
     A = rng.normal(size=(n, n))
     A *= 0.95 / max(abs(np.linalg.eigvals(A)).max(), 1e-3)
     model = LinearModel(A=A, B=rng.normal(size=(n, nu)), u_bar=rng.normal(size=nu), period=0.1)
@@ -149,12 +138,14 @@ def random_axes(rng: np.random.Generator, *, horizon: int, wider: float) -> Prob
         wider: by how much bounds on inputs and their steps are wider than those of `random_problem`.
     """
     parts = [random_problem(rng, horizon=horizon, n=n, nu=nu, n_c=nu) for n, nu in ((3, 1), (2, 2), (2, 1))]
-    order, mixing = rng.permutation(7), np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    order = rng.permutation(7)
+    mixing = np.linalg.qr(rng.normal(size=(4, 4)))[0]
     u_bar = rng.normal(size=4)
     Q_u = mixing @ block_diag(*(part.objective.Q_u for part in parts)) @ mixing.T
     limits = [part.bounds for part in parts if part.bounds is not None]
     C_c = block_diag(*(bounds.C_c for bounds in limits[:2]), np.zeros((0, 2)))
-    step, span = wider * rng.uniform(0.1, 2.0, 4), wider * rng.uniform(0.1, 3.0, 4)
+    step = wider * rng.uniform(0.1, 2.0, 4)
+    span = wider * rng.uniform(0.1, 3.0, 4)
     return Problem(
         model=LinearModel(
             A=block_diag(*(part.model.A for part in parts))[np.ix_(order, order)],
@@ -188,7 +179,11 @@ def with_terms(rng: np.random.Generator, problem: Problem, terms: Collection[str
         problem: with bounds on two outputs.
         terms: of soft, margins, Q_d, P, constraints.
     """
-    bounds, objective, N, n, nu = problem.bounds, problem.objective, problem.horizon, problem.model.n, problem.model.nu
+    bounds = problem.bounds
+    objective = problem.objective
+    N = problem.horizon
+    n = problem.model.n
+    nu = problem.model.nu
     assert bounds is not None
     m = len(bounds.C_c)
     if "soft" in terms:
@@ -202,33 +197,32 @@ def with_terms(rng: np.random.Generator, problem: Problem, terms: Collection[str
     if "P" in terms:
         factor = rng.normal(size=(n, rng.integers(1, n + 1)))
         objective = replace(objective, P=_symmetric(factor @ factor.T))
-    added = tuple(random_rows(rng, problem, soft=soft) for soft in (False, True)) if "constraints" in terms else ()
+    added: tuple[Constraint, ...] = ()
+    if "constraints" in terms:
+        added = (random_rows(rng, problem, soft=False), random_rows(rng, problem, soft=True))
     return replace(problem, objective=objective, bounds=bounds, constraints=(*problem.constraints, *added))
 
 
 def random_rows(rng: np.random.Generator, problem: Problem, *, soft: bool, rows: int = 2) -> Constraint:
     """C x + D u + E (u - u_before), one- and two-sided, with bounds on both sides of hover."""
-    n, nu = problem.model.n, problem.model.nu
+    n = problem.model.n
+    nu = problem.model.nu
     D = rng.normal(size=(rows, nu))
-    lower, upper = (
-        D @ problem.model.u_bar - rng.uniform(0.5, 1.5, rows),
-        D @ problem.model.u_bar + rng.uniform(0.5, 1.5, rows),
-    )
+    lower = D @ problem.model.u_bar - rng.uniform(0.5, 1.5, rows)
+    upper = D @ problem.model.u_bar + rng.uniform(0.5, 1.5, rows)
     lower[0] = -np.inf
-    return Constraint(
-        name="coupled",
-        C=rng.normal(size=(rows, n)),
-        D=D,
-        E=0.5 * rng.normal(size=(rows, nu)),
-        lower=lower,
-        upper=upper,
-        penalty=Penalty(l1=rng.uniform(0.0, 3.0, rows), l2=rng.uniform(0.1, 3.0, rows)) if soft else None,
-    )
+    C = rng.normal(size=(rows, n))
+    E = 0.5 * rng.normal(size=(rows, nu))
+    penalty = None
+    if soft:
+        penalty = Penalty(l1=rng.uniform(0.0, 3.0, rows), l2=rng.uniform(0.1, 3.0, rows))
+    return Constraint(name="coupled", C=C, D=D, E=E, lower=lower, upper=upper, penalty=penalty)
 
 
 def changing_period(rng: np.random.Generator, problem: Problem) -> Period:
     """Systems that differ from step to step, around the problem's own."""
-    model, N = problem.model, problem.horizon
+    model = problem.model
+    N = problem.horizon
     return Period(
         A=model.A + 0.1 * rng.normal(size=(N, model.n, model.n)),
         B=model.B + 0.3 * rng.normal(size=(N, model.n, model.nu)),
@@ -258,26 +252,34 @@ def frame(q_r: Array) -> Array:
 
 def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
     """A, B, c of x(k+1) ~ A x(k) + B u(k) + c about a state x (n,) and inputs u (4,), by central differences."""
-    joint, h = np.concatenate([x, u]), 1e-4
+    joint = np.concatenate([x, u])
+    h = 1e-4
 
     def after(joint: Array) -> Array:
         return next_state(model, joint[: model.n], joint[model.n :])
 
-    slopes = np.array([after(joint + step) - after(joint - step) for step in h * np.eye(joint.size)]).T / (2.0 * h)
-    A, B = slopes[:, : model.n], slopes[:, model.n :]
+    differences = [after(joint + step) - after(joint - step) for step in h * np.eye(joint.size)]
+    slopes = np.array(differences).T / (2.0 * h)
+    A = slopes[:, : model.n]
+    B = slopes[:, model.n :]
     return A, B, after(joint) - A @ x - B @ u
 
 
 def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
     """dx/dt (..., n) of states x (..., n) under inputs u (..., 4), by central differences over short periods."""
-    h, points = 1e-5, list(zip(x.reshape(-1, x.shape[-1]), u.reshape(-1, 4), strict=True))
-    ends = [np.array([next_state(replace(model, period=s), *point) for point in points]) for s in (h, -h)]
-    return np.asarray((ends[0] - ends[1]) / (2.0 * h)).reshape(x.shape)
+    h = 1e-5
+    forward = replace(model, period=h)
+    backward = replace(model, period=-h)
+    slopes = []
+    for state, inputs in zip(x.reshape(-1, x.shape[-1]), u.reshape(-1, 4), strict=True):
+        slopes.append((next_state(forward, state, inputs) - next_state(backward, state, inputs)) / (2.0 * h))
+    return np.array(slopes).reshape(x.shape)
 
 
 def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[Query]:
     """xi(k), y_d, u(k-1) of every `stride`-th period of a flight."""
-    log, N = flight.log.control, problem.horizon
+    log = flight.log.control
+    N = problem.horizon
     reference = paper_reference(log.t.size + N)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
     return [
@@ -352,40 +354,6 @@ def small_log(periods: int = 4, *, steps: int = 5, seed: int = 0, reason: str | 
         predicted=rng.normal(size=(periods, 6, 3)).astype(np.float32) if periods else None,
         reason=reason,
     )
-
-
-def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float]) -> FlightLog:
-    """A made-up flight where one state is as given, in its own unit, and all else is zero.
-
-    One sample per 0.1 s; plant rows spread evenly, the first at t = 0, the last at the end of the last period.
-    """
-    steps, rest = divmod(len(plant) - 1, len(samples))
-    assert rest == 0, "plant rows must be a whole number per period, plus one"
-    log = small_log(len(samples), steps=steps)
-    control = replace(
-        log.control,
-        state=(state := np.zeros_like(log.control.state)),
-        truth=state,
-        reference=np.zeros_like(log.control.reference),
-    )
-    flown = replace(log.plant, state=np.zeros_like(log.plant.state))
-    control.state[:, INDEX[state_name]] = samples
-    flown.state[:, INDEX[state_name]] = plant
-    return replace(log, control=control, plant=flown)
-
-
-def fly_once(
-    scenario: Scenario,
-    plant: Plant,
-    controller: Controller,
-    reference: Array,
-    *,
-    navigation: Navigation | None,
-) -> FlightLog:
-    """Fly a scenario with a plant and a controller that were built for it; no set-points, no other controllers."""
-    loop = closed_loop(Assembly(scenario), plant, controller, reference, navigation=navigation)
-    complete(loop, periods=scenario.periods)
-    return loop.log()
 
 
 def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:

@@ -124,11 +124,11 @@ def imports() -> list[Import]:
 
 def loaded_by(code: str) -> set[str]:
     """Top-level names of all modules that a fresh interpreter has loaded after some code; two levels of ours."""
-    first = "{name.partition('.')[0] for name in sys.modules}"
-    ours = "{'.'.join(name.split('.')[:2]) for name in sys.modules if name.startswith('quadsim.')}"
-    report = f"import sys\nprint(*{first}, *{ours}, file=sys.stderr)"
+    report = "import sys\nprint(*sys.modules, file=sys.stderr)"
     command = [sys.executable, "-c", f"{code}\n{report}"]
-    return set(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stderr.split())
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    names = [name.split(".") for name in done.stderr.split()]
+    return {name[0] for name in names} | {".".join(name[:2]) for name in names if name[0] == "quadsim"}
 
 
 def declared() -> set[str]:
@@ -205,17 +205,16 @@ def test_every_part_of_mpc_imports_those_before_it_in_the_list(imports: list[Imp
 
 
 def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[Import]) -> None:
-    named = {i.imported for i in imports if f"{i.importer}.".startswith("quadsim.mpc.")}
-    others = {name for name in named if name.startswith("quadsim") and not name.startswith("quadsim.mpc")}
-    assert others <= MPC_MAY_IMPORT
-    assert "mujoco" not in {name.partition(".")[0] for name in named}
+    of_controllers = [item for item in imports if f"{item.importer}.".startswith("quadsim.mpc.")]
+    others = {item.imported for item in of_controllers if item.library == "quadsim"}
+    assert {name for name in others if not name.startswith("quadsim.mpc")} <= MPC_MAY_IMPORT
+    assert "mujoco" not in {item.library for item in of_controllers}
 
 
 def test_controllers_run_without_a_simulator() -> None:
     optional = {"quadsim.mpc.solvers.daqp": "daqp", "quadsim.mpc.solvers.qpsolvers": "qpsolvers"}
-    loaded = loaded_by(
-        "import " + ", ".join(name for name in set(modules()) - set(optional) if name.startswith("quadsim.mpc"))
-    )
+    controllers = [name for name in modules() if name.startswith("quadsim.mpc") and name not in optional]
+    loaded = loaded_by(f"import {', '.join(controllers)}")
     above = {f"quadsim.{folder}" for folder in floors()[floors().index("mpc") + 1 :]}
     assert {"quadsim.mpc", "quadsim", "piqp"} <= loaded
     assert not loaded & {"mujoco", "pydantic", *above, *OF_ONE_PLACE, *optional.values()}
@@ -225,14 +224,16 @@ def test_controllers_run_without_a_simulator() -> None:
 def test_a_library_for_outputs_is_imported_in_one_place_and_late(library: str, imports: list[Import]) -> None:
     uses = [item for item in imports if item.library == library]
     assert uses or library in ABSENT
-    assert not [item for item in uses if not f"{item.importer}.".startswith(f"{OF_ONE_PLACE[library]}.")]
-    at_start = {item.importer for item in uses if item.at_start and library != "gymnasium"}
-    assert not [name for name in at_start - {RENDER_WORKER} if not RECORDING.fullmatch(name)]
+    for item in uses:
+        assert f"{item.importer}.".startswith(f"{OF_ONE_PLACE[library]}."), item
+        may_be_early = item.importer == RENDER_WORKER or RECORDING.fullmatch(item.importer) or library == "gymnasium"
+        assert may_be_early or not item.at_start, item
 
 
 def test_what_records_is_imported_late(imports: list[Import]) -> None:
-    uses = [item for item in imports if RECORDING.fullmatch(item.imported)]
-    assert not [i for i in uses if i.at_start and not RECORDING.fullmatch(i.importer)]
+    for item in imports:
+        if RECORDING.fullmatch(item.imported) and not RECORDING.fullmatch(item.importer):
+            assert not item.at_start, item
 
 
 def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:
@@ -241,17 +242,19 @@ def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:
 
 def test_no_module_and_no_folder_imports_what_imports_it(imports: list[Import]) -> None:
     ours = modules()
-    packages = {"", *(name.rpartition(".")[0] for name in ours if "." in name)}
+    packages = {name.rpartition(".")[0] for name in ours}
     for package in packages:
         within = f"{package}." if package else ""
+
+        def child(name: str, within: str = within) -> str:
+            """The module or folder of the package that has a module."""
+            return name.removeprefix(within).partition(".")[0]
+
         graph: dict[str, set[str]] = {}
         for item in imports:
-            if item.at_start and item.imported in ours and item.importer.startswith(within):
-                importer, imported = (
-                    name.removeprefix(within).partition(".")[0] for name in (item.importer, item.imported)
-                )
-                if item.imported.startswith(within) and imported != importer:
-                    graph.setdefault(importer, set()).add(imported)
+            inside = item.importer.startswith(within) and item.imported.startswith(within)
+            if item.at_start and item.imported in ours and inside and child(item.imported) != child(item.importer):
+                graph.setdefault(child(item.importer), set()).add(child(item.imported))
         tuple(TopologicalSorter(graph).static_order())  # raises where there is a cycle
 
 
@@ -261,21 +264,29 @@ def circles(imports: list[Import]) -> list[list[str]]:
     What hands out public names (`HANDING_OUT`) counts as any module; that importing a module runs its packages does
     not.
     """
-    ours, graph = modules(), dict[str, set[str]]()
+    ours = modules()
+    graph: dict[str, set[str]] = {}
     for item in imports:
         if item.imported in ours and item.imported != item.importer:
             graph.setdefault(item.importer, set()).add(item.imported)
 
     def reached(start: str) -> set[str]:
-        todo, found = [start], set[str]()
-        while todo:
-            todo += (new := graph.get(todo.pop(), set()) - found)
+        """The modules that a module imports, directly or through others."""
+        found: set[str] = set()
+        to_visit = [start]
+        while to_visit:
+            new = graph.get(to_visit.pop(), set()) - found
             found |= new
+            to_visit += new
         return found
 
     reach = {name: reached(name) for name in graph}
-    groups = {tuple(sorted(other for other in reach[name] if name in reach.get(other, ()))) for name in graph}
-    return sorted(([*group] for group in groups if group), key=len, reverse=True)
+    groups = set()
+    for name in graph:
+        group = sorted(other for other in reach[name] if name in reach.get(other, ()))
+        if group:
+            groups.add(tuple(group))
+    return [[*group] for group in sorted(groups)]
 
 
 def test_a_circle_is_seen_even_if_it_closes_late_or_for_types_alone() -> None:
@@ -331,8 +342,17 @@ def public_names(source: str) -> set[str]:
 
 
 def test_a_public_name_is_one_that_a_module_defines() -> None:
-    lines = "import a", "_B = 1", "C: int = 2", "d[0] = 3", "E = F = Any", "if a:", "    G, H = 4, 5", "def i(): j = 6"
-    source = "\n".join([*lines, "class K: l = 7"])
+    source = """
+import a
+_B = 1
+C: int = 2
+d[0] = 3
+E = F = Any
+if a:
+    G, H = 4, 5
+def i(): j = 6
+class K: l = 7
+"""
     assert public_names(source) == {"C", "G", "H", "i", "K"}
 
 
@@ -341,8 +361,8 @@ def test_no_other_public_names_are_defined_twice() -> None:
     for module, path in modules().items():
         for name in public_names(path.read_text()):
             places.setdefault(name, []).append(module)
-    twice = {name: sorted(of) for name, of in sorted(places.items()) if len(of) > 1}
-    assert {name: of for name, of in twice.items() if name not in DEFINED_TWICE} == {}
+    twice = {name: sorted(definers) for name, definers in places.items() if len(definers) > 1}
+    assert {name: definers for name, definers in twice.items() if name not in DEFINED_TWICE} == {}
 
 
 def formulas(source: str) -> Iterator[tuple[str, ...]]:
@@ -358,7 +378,8 @@ def formulas(source: str) -> Iterator[tuple[str, ...]]:
 
 
 def test_a_formula_is_found_whatever_its_names_are() -> None:
-    one, other = "real a = R(2.0) * (q[1] * q[3] + q[0] * q[2]);", "/* = */ x->b += 2.0 * (w[1] * w[3] + w[0] * w[2]);"
+    one = "real a = R(2.0) * (q[1] * q[3] + q[0] * q[2]);"
+    other = "/* = */ x->b += 2.0 * (w[1] * w[3] + w[0] * w[2]);"
     assert [*formulas(one)] == [*formulas(other)] != []
     assert [*formulas(one.replace("q[0]", "p[0]"))] != [*formulas(other)]
 
@@ -423,7 +444,8 @@ def removals(source: str) -> Iterator[str]:
     """Calls that remove or replace files, of `os`, `shutil` and `pathlib`; `text.replace` has two arguments."""
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            name, owner = node.func.attr, ast.unparse(node.func.value)
+            name = node.func.attr
+            owner = ast.unparse(node.func.value)
             if name == "replace":
                 removes = (len(node.args) == 1 or owner == "os") and owner not in ("dataclasses", "scenario")
             else:

@@ -51,7 +51,8 @@ def test_a_layout_without_a_mixer_is_refused(example: ModuleType) -> None:
 
 def test_channels_are_degrees_per_second_and_the_root_of_the_thrust(example: ModuleType) -> None:
     """A microsecond is 1 deg/s, roll and yaw to the right, nose down; thrust is the square of the motors' share."""
-    rates, rest = np.radians([100.0, -20.0, 30.0]), np.zeros(3)
+    rates = np.radians([100.0, -20.0, 30.0])
+    rest = np.zeros(3)
     assert example.channels(np.array([20.0, *rates]), 20.0) == [1600, 1480, 2000, 1470, 2000]
     assert example.channels(np.array([5.0, *rest]), 20.0) == [1500, 1500, 1506, 1500, 2000]
     assert example.channels(np.array([-1.0, 90.0, -90.0, 90.0]), 20.0) == [2000, 1000, 1011, 1000, 2000]

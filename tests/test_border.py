@@ -98,7 +98,9 @@ def test_whatever_is_raised_before_the_flight_is_one_message(
 
 def test_an_autopilot_that_raises_ends_the_flight_or_is_refused(raised: BaseException) -> None:
     class Pilot:
-        rate, takes_targets, calls = 500.0, True, 0
+        rate = 500.0
+        takes_targets = True
+        calls = 0
 
         def reset(self) -> None: ...
 

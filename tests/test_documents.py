@@ -47,7 +47,8 @@ ENTRY_POINTS = {"quadsim.controllers"}
 @pytest.mark.parametrize("name", PAPER)
 def test_the_papers_flights_give_their_golden_numbers(name: str, fly_once: Callable[..., Flight]) -> None:
     """Of errors [m, deg], margins [deg, rad/s] and seconds; counts are exact."""
-    result, golden = paper_entry(fly_once(name)), read("paper")[name]
+    result = paper_entry(fly_once(name))
+    golden = read("paper")[name]
     assert result["rmse"] == pytest.approx(golden["rmse"], abs=1e-3)
     assert result["final_error"] == pytest.approx(golden["final_error"], abs=1e-5)
     for bound, numbers in golden["bounds"].items():
@@ -109,7 +110,8 @@ def test_the_sites_search_corrects_long_words_alone_and_is_changed_once() -> Non
 @pytest.mark.slow("pages")
 @pytest.mark.parametrize("constraints", ABLATION)
 def test_constraints_one_by_one_give_their_golden_numbers(constraints: str) -> None:
-    result, golden = ablation_entry(constraints), read("ablation")[constraints]
+    result = ablation_entry(constraints)
+    golden = read("ablation")[constraints]
     assert result["lost"] == golden["lost"]
     assert result["rmse"] == pytest.approx(golden["rmse"], abs=1e-3)
 
@@ -122,7 +124,8 @@ def test_tables_of_golden_numbers_are_filled(document: str) -> None:
 
 
 def test_every_scenario_in_the_library_opens_a_text_and_has_a_drawing() -> None:
-    texts, page = gallery.texts(), library.html()
+    texts = gallery.texts()
+    page = library.html()
     assert library.PLACE in (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     assert set(re.findall(r"scenarios/([\w-]+)\.txt", page)) == {*texts} == {*scenario_names()}
     for file in re.findall(r'(?:src|poster)="(assets/[^"]+)"', page):
@@ -231,7 +234,8 @@ def test_python_on_the_pages_runs(page: Path, tmp_path: Path, monkeypatch: pytes
 
 def test_the_notebook_is_the_tutorial_whose_blocks_run() -> None:
     """Its cells are the blocks that the test above runs."""
-    stored, page = notebook.NOTEBOOK.read_text(encoding="utf-8"), notebook.PAGE.read_text(encoding="utf-8")
+    stored = notebook.NOTEBOOK.read_text(encoding="utf-8")
+    page = notebook.PAGE.read_text(encoding="utf-8")
     assert stored == notebook.notebook(page), "python docs/tools/notebook.py"
     cells = json.loads(stored)["cells"]
     assert ["".join(cell["source"]) + "\n" for cell in cells if cell["cell_type"] == "code"] == PYTHON[notebook.PAGE]

@@ -139,7 +139,8 @@ def test_every_requirement_is_pinned() -> None:
     pins = [line for line in lines if not line.startswith("#")]
     assert [pin for pin in pins if not re.fullmatch(r"[\w.-]+==\w[\w.]*", pin)] == []
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    project, groups = pyproject["project"], pyproject["dependency-groups"]
+    project = pyproject["project"]
+    groups = pyproject["dependency-groups"]
     required = itertools.chain(project["dependencies"], *project["optional-dependencies"].values(), *groups.values())
     open_ended = (requirement for requirement in required if "==" not in requirement)
     names = {plain(re.split(r"[<>=[]", requirement, maxsplit=1)[0]) for requirement in open_ended}

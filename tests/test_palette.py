@@ -34,7 +34,8 @@ MATERIALS = {
 """Colours of things, which say nothing of a flight, and what they are."""
 DRAWING = ("quadsim/report", "quadsim/sim/airframe.py", "quadsim/features/live", "docs")
 """Where a tuple of numbers may be a colour."""
-PAGE, DARK_PAGE = "#ffffff", "#14171a"
+PAGE = "#ffffff"
+DARK_PAGE = "#14171a"
 BLINDNESS = {
     "none": np.eye(3),
     "protanopia": [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],

@@ -576,9 +576,11 @@ def test_a_file_that_is_too_large_is_not_read(
 ) -> None:
     path = tmp_path / expected[1:].partition(":")[0]
     if path.suffix == ".toml":
-        load, text = load_file, 'base = "hover"\nname = "mine"\n\n'
+        load = load_file
+        text = 'base = "hover"\nname = "mine"\n\n'
     else:
-        load, text = load_course, "t,x,y,z,yaw\n" + "0.0,0.0,0.0,1.0,0\n" + "1.0,0.0,0.0,1.0,0\n"
+        load = load_course
+        text = "t,x,y,z,yaw\n" + "0.0,0.0,0.0,1.0,0\n" + "1.0,0.0,0.0,1.0,0\n"
     load(path, text)
     monkeypatch.setattr(limit, most)
     assert matches(refusal(lambda: load(path, text)), expected)

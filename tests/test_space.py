@@ -32,7 +32,8 @@ from quadsim.space import (
 from quadsim.state import Array
 
 STILL = np.zeros(1)
-numbers, lengths = st.floats(-2.0, 2.0), st.floats(0.2, 2.0)
+numbers = st.floats(-2.0, 2.0)
+lengths = st.floats(0.2, 2.0)
 vectors = st.tuples(numbers, numbers, numbers)
 shared = {"name": st.just("it"), "position": vectors}
 boxes = st.builds(Box, **shared, size=st.tuples(lengths, lengths, lengths), yaw=st.floats(-180.0, 180.0))
@@ -65,7 +66,8 @@ def holds(obstacle: AnyObstacle, points: Array) -> np.ndarray:
             [np.linalg.norm(p - along, axis=1).min() <= obstacle.radius for p in points - obstacle.position]
         )
     yaw = math.radians(obstacle.yaw)
-    along, across = math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x
+    along = math.cos(yaw) * x + math.sin(yaw) * y
+    across = math.cos(yaw) * y - math.sin(yaw) * x
     local = np.stack([along, across, z], axis=1)
     inside = (np.abs(local) <= np.array(obstacle.size) / 2).all(axis=1)
     if isinstance(obstacle, Wall):
@@ -79,7 +81,8 @@ def test_the_nearest_point_is_of_the_surface(obstacle: AnyObstacle, points: list
     distances, normals = obstacle.clearances(np.zeros(len(p)), p)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1.0, atol=1e-12)
     nearest = distances.argmin(axis=0), np.arange(len(p))
-    distance, normal = distances[nearest], normals[nearest]
+    distance = distances[nearest]
+    normal = normals[nearest]
     far = np.abs(distance) > 1e-5
     np.testing.assert_array_equal((distance < 0.0)[far], holds(obstacle, p)[far])
     if isinstance(obstacle, Wall):  # whose solids overlap
@@ -94,11 +97,13 @@ def test_the_normal_is_the_gradient_and_the_distance_no_steeper(
     obstacle: AnyObstacle, point: tuple[float, ...], step: tuple[float, ...]
 ) -> None:
     """As it is 0 on the surface, no point of that is nearer."""
-    p, d = 2.0 * np.array([point]), np.array([step])
+    p = 2.0 * np.array([point])
+    d = np.array([step])
     before, after = (obstacle.clearance(STILL, q)[0] for q in (p, p + d))
     assert abs(after - before) <= np.linalg.norm(d) + 1e-9
     for solid in obstacle.solids:
-        relative, h = p - obstacle.position, 1e-6
+        relative = p - obstacle.position
+        h = 1e-6
         normal = solid.clearance(relative)[1]
         slope = [
             (solid.clearance(relative + h * e)[0] - solid.clearance(relative - h * e)[0])[0] / (2 * h)
@@ -150,9 +155,11 @@ def test_obstacles_move_as_stated() -> None:
 def test_a_region_s_clearance_is_the_ball_s_that_fits(
     points: list[tuple[float, float, float]], size: tuple[float, float, float], yaw: float
 ) -> None:
-    box, region = Box(name="b", position=(0, 0, 0), size=size, yaw=yaw), Fence(position=(0, 0, 0), size=size, yaw=yaw)
+    box = Box(name="b", position=(0, 0, 0), size=size, yaw=yaw)
+    region = Fence(position=(0, 0, 0), size=size, yaw=yaw)
     p = np.array(points)
-    t, solid = np.zeros(len(p)), box.clearance(np.zeros(len(p)), np.array(points))
+    t = np.zeros(len(p))
+    solid = box.clearance(np.zeros(len(p)), np.array(points))
     inside = solid < 0.0
     np.testing.assert_allclose(region.clearance(t, p)[inside], -solid[inside], atol=1e-12)
     assert (region.clearance(t, p)[~inside] >= -solid[~inside] - 1e-12).all()
@@ -171,7 +178,9 @@ def test_shapes_survive_json(obstacle: AnyObstacle) -> None:
 
 
 def test_a_window_of_the_path_is_one_of_time() -> None:
-    t, x = np.arange(8.0), np.array([0.0, 0.0, 1.0, 2.0, 2.0, 2.0, 4.0, 4.0])  # rests at 0, 2 and 4 m
+    # rests at 0, 2 and 4 m
+    t = np.arange(8.0)
+    x = np.array([0.0, 0.0, 1.0, 2.0, 2.0, 2.0, 4.0, 4.0])
     positions = np.stack([x, -x, np.zeros(8)], axis=1) / math.sqrt(2.0)
     for path, window in {
         (0.0, 1.0): (0.0, 2.0),
@@ -189,7 +198,8 @@ def test_a_window_of_the_path_is_one_of_time() -> None:
 
 @given(shapes=st.lists(obstacles, min_size=1, max_size=5))
 def test_many_are_measured_as_each_alone(shapes: list[AnyObstacle]) -> None:
-    t, p = np.linspace(0.0, 3.0, 9), np.random.default_rng(0).normal(scale=2.0, size=(9, 3))
+    t = np.linspace(0.0, 3.0, 9)
+    p = np.random.default_rng(0).normal(scale=2.0, size=(9, 3))
     for result, desired in zip(
         Solids(shapes).clearances(t, p),
         map(np.concatenate, zip(*(each.clearances(t, p) for each in shapes), strict=True)),
@@ -211,6 +221,7 @@ def test_footprints_are_as_wide_as_the_solid(obstacle: AnyObstacle) -> None:
 @given(axis=st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda axis: np.linalg.norm(axis) > 0.1))
 def test_half_turns_about_any_axis_are_those_of_mujoco(axis: tuple[float, float, float]) -> None:
     unit = np.array(axis) / np.linalg.norm(axis)
-    turn, again = 2.0 * np.outer(unit, unit) - np.eye(3), np.empty(9)
+    turn = 2.0 * np.outer(unit, unit) - np.eye(3)
+    again = np.empty(9)
     mujoco.mju_quat2Mat(again, Solid(kind="box", size=(1.0, 1.0, 1.0), centre=np.zeros(3), turn=turn).quaternion)
     np.testing.assert_allclose(again.reshape(3, 3), turn, atol=1e-6)

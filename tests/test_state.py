@@ -93,7 +93,8 @@ def test_a_reference_starts_on_the_vehicle_s_turn_and_goes_on_without_jumps() ->
 
 
 def test_a_reference_keeps_its_turn_while_noise_moves_the_vehicle_about_half_a_turn_away() -> None:
-    turns, rng = ReferenceTurns(), np.random.default_rng(2)
+    turns = ReferenceTurns()
+    rng = np.random.default_rng(2)
     assert turns.follow(headed(-0.1), math.radians(179.9))[0, 3] == math.radians(-0.1)
     for k in range(200):  # the reference itself is on another turn in each period
         seen = math.radians(180.0 + 3.0 * rng.standard_normal())
@@ -113,7 +114,8 @@ def test_turns_are_counted_from_minus_half_to_half() -> None:
 
 
 def test_a_loop_leaves_the_yaw_however_it_turns_upside_down() -> None:
-    turns, flown = YawUnwrapper(0.0), ((math.pi, -2.78), (math.pi, 2.9), (0.1, 0.1))
+    turns = YawUnwrapper(0.0)
+    flown = ((math.pi, -2.78), (math.pi, 2.9), (0.1, 0.1))
     yaws = [turns.unwrapped(np.array([roll, 0.0, yaw])) for roll, yaw in flown]
     assert yaws == pytest.approx([-2.78, 2.9 - TURN, 0.1])
 
@@ -121,7 +123,9 @@ def test_a_loop_leaves_the_yaw_however_it_turns_upside_down() -> None:
 def test_many_references_follow_their_vehicles_turns_as_single_ones_do() -> None:
     """Turning references and vehicles, noise, leaps of the vehicle, and yaws that are no number."""
     rng = np.random.default_rng(3)
-    count, rows, periods = 6, 5, 200
+    count = 6
+    rows = 5
+    periods = 200
     rates = np.array([0.0, 0.3, -0.5, 2.0, 1.0, 0.2])
     firsts = np.full(count, np.nan)
     singles = [ReferenceTurns() for _ in range(count)]

@@ -43,7 +43,8 @@ def mapped(linear: float = 0.4) -> Vehicle:
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
 @pytest.mark.parametrize("linear", [-0.05, 0.4, 1.0])
 def test_the_plant_has_exactly_its_thrust_and_a_torque_in_proportion(linear: float, integrator: Integrator) -> None:
-    vehicle, speeds = mapped(linear), np.array([300.0, 420.0, 510.0, 600.0])
+    vehicle = mapped(linear)
+    speeds = np.array([300.0, 420.0, 510.0, 600.0])
     a1, a2 = vehicle.thrust_of_speed
     thrusts = a1 * speeds + a2 * speeds**2
     np.testing.assert_allclose(vehicle.thrusts(speeds), thrusts, rtol=1e-14)
@@ -59,7 +60,8 @@ def test_the_plant_has_exactly_its_thrust_and_a_torque_in_proportion(linear: flo
 
 
 def test_a_map_without_linear_term_flies_as_its_coefficient_does() -> None:
-    square, speeds = mapped(0.0), HUMMINGBIRD.hover_speed * np.array([0.9, 1.0, 1.1, 1.2])
+    square = mapped(0.0)
+    speeds = HUMMINGBIRD.hover_speed * np.array([0.9, 1.0, 1.1, 1.2])
     np.testing.assert_allclose(square.coefficients, HUMMINGBIRD.coefficients, rtol=1e-14)
     states = []
     for vehicle in (square, HUMMINGBIRD):
@@ -75,7 +77,8 @@ def test_models_have_its_hover_and_its_slope(layout: str) -> None:
     if layout == "uneven":
         top = 1.5e-5 * uneven().speed_max ** 2
         vehicle = altered(uneven(), {"thrust_of_speed": (0.4 * top / uneven().speed_max, 0.9e-5)})
-    hover, weight = vehicle.hover_speeds, vehicle.mass * vehicle.gravity
+    hover = vehicle.hover_speeds
+    weight = vehicle.mass * vehicle.gravity
     np.testing.assert_allclose(vehicle.thrusts(hover), weight * vehicle.thrust_shares, rtol=1e-12)
     np.testing.assert_allclose(vehicle.allocation @ hover**2, [weight, 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-9)
     a1, a2 = vehicle.thrust_of_speed
@@ -89,7 +92,8 @@ def test_models_have_its_hover_and_its_slope(layout: str) -> None:
 
 @pytest.mark.parametrize("vehicle", [mapped(-0.05), mapped(), mapped(1.0), published("cf21b")], ids=lambda v: v.name)
 def test_allocation_and_autopilot_invert_it(vehicle: Vehicle) -> None:
-    allocation, weight = make_allocation(vehicle), vehicle.mass * vehicle.gravity
+    allocation = make_allocation(vehicle)
+    weight = vehicle.mass * vehicle.gravity
     speeds = vehicle.hover_speed * np.array([0.9, 1.0, 1.1, 1.2])
     thrusts, (x, y, _) = vehicle.thrusts(speeds), vehicle.hubs.T
     yaw = vehicle.drag_to_thrust * thrusts @ np.array(vehicle.rotor_spins)
@@ -98,7 +102,8 @@ def test_allocation_and_autopilot_invert_it(vehicle: Vehicle) -> None:
     low, high = (np.full(4, limit) for limit in (vehicle.speed_min, vehicle.speed_max))
     np.testing.assert_allclose(allocate(allocation, wrench, low, high), speeds, rtol=1e-9)
     assert allocate(allocation, 9.0 * weight * np.array([1.0, 0.0, 0.0, 0.0]), low, high) == pytest.approx(high)
-    autopilot, level = Autopilot(vehicle, AutopilotSettings(delay=0.0)), np.array([1.0, 0.0, 0.0, 0.0])
+    autopilot = Autopilot(vehicle, AutopilotSettings(delay=0.0))
+    level = np.array([1.0, 0.0, 0.0, 0.0])
     for share in (0.7, 1.0, 1.4):
         answer = autopilot.speeds(0.0, share * weight * level, np.zeros(3), vehicle.hover_speeds, level)
         assert vehicle.thrusts(answer).sum() == pytest.approx(share * weight, rel=1e-9)
@@ -106,7 +111,8 @@ def test_allocation_and_autopilot_invert_it(vehicle: Vehicle) -> None:
 
 def test_power_is_torque_times_speed() -> None:
     battery = Battery(cells=4, capacity=2.0, hover_current=8.0).resolved(HUMMINGBIRD)
-    vehicle, drawn = mapped(), []
+    vehicle = mapped()
+    drawn = []
     for ratio in (1.0, 1.3):
         with Plant(vehicle, effects=Effects(battery=battery)) as plant:
             charge = plant.advance(ratio * vehicle.hover_speeds, 2)["battery"][:, 1]
@@ -182,7 +188,8 @@ def test_an_impossible_map_is_refused(changes: dict[str, Any], message: str) -> 
 
 
 def test_a_wrong_map_is_one_message_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, text = tmp_path / "mine.toml", (FILES / "cf21b.toml").read_text(encoding="utf-8")
+    path = tmp_path / "mine.toml"
+    text = (FILES / "cf21b.toml").read_text(encoding="utf-8")
     path.write_text(text.replace("[-2.9922e-06, 4.01903e-08]", "[-2.9922e-06, -4.01903e-08]"), encoding="utf-8")
     assert main(["check", "hover", "--set", f"vehicle.file={path}"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()

@@ -26,7 +26,9 @@ def test_it_hovers_at_the_speed_of_table_1(vehicle: Vehicle) -> None:
 
 
 def test_the_wrench_is_that_of_sec_2_2(vehicle: Vehicle) -> None:
-    b, d, arm = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient), vehicle.arm_length
+    b = vehicle.thrust_coefficient
+    d = vehicle.drag_to_thrust * vehicle.thrust_coefficient
+    arm = vehicle.arm_length
     w = np.array([180.0, 190.0, 200.0, 215.0])
     w1, w2, w3, w4 = w**2
     expected = [
@@ -128,7 +130,8 @@ def test_the_trim_carries_the_weight_without_torque(name: str) -> None:
 
 
 def test_turning_and_its_inverse_have_the_products_of_inertia() -> None:
-    vehicle, rates = uneven(), np.random.default_rng(0).normal(size=(5, 3))
+    vehicle = uneven()
+    rates = np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(vehicle.momentum(rates), rates @ vehicle.inertia_matrix)
     np.testing.assert_allclose(vehicle.angular_acceleration(vehicle.momentum(rates)), rates)
     for each in (vehicle, dataclasses.replace(vehicle, products_of_inertia=None)):

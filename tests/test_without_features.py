@@ -93,7 +93,8 @@ def test_what_tests_use_of_other_features_is_stated() -> None:
     }
     missing = {}
     for path in TESTS.rglob("test_*.py"):
-        name, folders = path.relative_to(TESTS).as_posix(), {path, *path.parents}
+        name = path.relative_to(TESTS).as_posix()
+        folders = {path, *path.parents}
         own = {feature for feature in FEATURES if folders & parts[feature]}
         features = used_by(path) - own - {*taking.USING.get(name, ())}
         if features and not folders & apart:

@@ -92,7 +92,8 @@ def damaged(summary: dict[str, Any], path: tuple[str | int, ...], value: Any) ->
 
 @pytest.mark.slow("process")
 def test_a_damaged_summary_is_one_message_whatever_is_damaged(run: Path, tmp_path: Path) -> None:
-    summary, refused = summary_of(run), 0
+    summary = summary_of(run)
+    refused = 0
     for path, value in damages(summary):
         other = rewritten(run, tmp_path, damaged(summary, path, value))
         try:

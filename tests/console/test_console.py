@@ -71,7 +71,8 @@ def shown(parts: Iterable[RenderableType], width: int) -> list[str]:
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_sentences_break_at_spaces_and_paths_and_commands_stay_whole(short_run: Any, width: int) -> None:
-    path, words = Path("/", *["folder"] * 30), ["constraint"] * 40
+    path = Path("/", *["folder"] * 30)
+    words = ["constraint"] * 40
     sentence = f"{' '.join(words)} {path} {' '.join(words)}"
     lines = shown([sentence, Text(sentence)], width)
     assert " ".join(lines).split() == [*words, str(path), *words] * 2
@@ -95,7 +96,8 @@ def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run:
 
 
 def test_the_legend_of_an_audit_explains_only_what_occurs(short_run: Any) -> None:
-    roll, slew = short_run.findings[0], short_run.findings[3]
+    roll = short_run.findings[0]
+    slew = short_run.findings[3]
     assert (slew.limit.name, roll.limit.name) == ("slew", "roll")
     roll = replace(roll, worst_margin=2.0, worst_margin_sampled=2.0, peak_plant=3.0, peak_sampled=3.0)
     reported = replace(roll.limit, required=False)

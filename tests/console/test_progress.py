@@ -23,7 +23,8 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], list[str]]]:
     monkeypatch.setattr(console, "stderr", lambda: PlainConsole(stderr=True, file=shown))
 
     def wait() -> list[str]:
-        there, deadline = shown.getvalue().count("\n"), clock.monotonic() + 20.0
+        there = shown.getvalue().count("\n")
+        deadline = clock.monotonic() + 20.0
         while shown.getvalue().count("\n") < there + 2 and clock.monotonic() < deadline:
             clock.sleep(0.01)
         return shown.getvalue().splitlines()
@@ -63,7 +64,8 @@ def test_a_terminal_has_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     shown = io.StringIO()
     screen = PlainConsole(file=shown, width=80)
-    screen._force_terminal, screen.is_interactive = True, True
+    screen._force_terminal = True
+    screen.is_interactive = True
     monkeypatch.setattr(console, "stderr", lambda: screen)
     with reporting(True, "the flight") as report:
         report("flight", 1, 4)

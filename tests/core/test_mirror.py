@@ -134,7 +134,8 @@ def test_a_pointer_to_a_struct_takes_that_struct_alone() -> None:
     with pytest.raises(ctypes.ArgumentError):
         reset(ctypes.addressof(work))
     restart = core_library().quadsim_ramp_reset
-    ramp, numbers = struct("quadsim_ramp")(), struct("quadsim_ramp_numbers")()
+    ramp = struct("quadsim_ramp")()
+    numbers = struct("quadsim_ramp_numbers")()
     acting = np.arange(1.0, 5.0)
     array = (ctypes.c_double * 4)(*acting)
     for pointer in (ramp, ctypes.byref(ramp), ctypes.pointer(ramp)):

@@ -56,7 +56,8 @@ def replies(name: str, precision: Precision) -> list[Reply]:
 @pytest.mark.parametrize("precision", TOLERANCE)
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_all_recorded_periods_have_the_same_status_and_the_exact_command(name: str, precision: Precision) -> None:
-    desired, result = recording(name), replies(name, precision)
+    desired = recording(name)
+    result = replies(name, precision)
     status = np.array([min(reply.status, REFUSED) for reply in result])
     np.testing.assert_array_equal(status, desired.status)
     optimal = desired.status < REFUSED
@@ -68,8 +69,10 @@ def test_all_recorded_periods_have_the_same_status_and_the_exact_command(name: s
 @pytest.mark.parametrize("name", OTHERS)
 def test_other_flights_too(name: str, precision: Precision) -> None:
     """In float rounding may make a bound active, which changes the status; the rows of `polytopes` are hard on it."""
-    desired, result = recording(name), replies(name, precision)
-    status, optimal = np.array([min(reply.status, REFUSED) for reply in result]), desired.status < REFUSED
+    desired = recording(name)
+    result = replies(name, precision)
+    status = np.array([min(reply.status, REFUSED) for reply in result])
+    optimal = desired.status < REFUSED
     np.testing.assert_array_equal(status < REFUSED, optimal)
     if precision == "double":
         np.testing.assert_array_equal(status, desired.status)
@@ -117,7 +120,8 @@ def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> N
 def drawn(name: str = "paper-constrained") -> list[tuple[Array, Array, Array]]:
     """1 000 states around a flight, with references and commands in force; some have no answer."""
     rng = np.random.default_rng(3)
-    flight, N = recording(name), load_scenario(name).controller.horizon
+    flight = recording(name)
+    N = load_scenario(name).controller.horizon
     spread = 0.75 * np.array([0.3, 0.5, 0.3, 0.5, 0.3, 0.5, 0.02, 0.15, 0.02, 0.15, 0.2, 0.3])
     result = []
     for k in rng.integers(0, len(flight.state), 1000):
@@ -143,7 +147,9 @@ FLOATS = {
 def test_floats_are_near_doubles_in_drawn_states(name: str, warm: bool) -> None:
     """Rows that nearly depend on each other are where floats are far off, or give up."""
     hosts = [Host(load_scenario(name), precision, rows=200) for precision in PRECISIONS]
-    distances, differ, hover = list[float](), 0, np.full(4, 188.0)
+    distances = list[float]()
+    differ = 0
+    hover = np.full(4, 188.0)
     for k, query in enumerate(drawn(name)):
         if k == 0 or not warm:
             for host in hosts:
@@ -161,7 +167,8 @@ def test_floats_are_near_doubles_in_drawn_states(name: str, warm: bool) -> None:
 
 def test_more_active_rows_than_there_is_room_for_end_as_defined() -> None:
     scenario = load_scenario("paper-constrained")
-    usual, small = Host(scenario, rows=160), Host(scenario, rows=20)
+    usual = Host(scenario, rows=160)
+    small = Host(scenario, rows=20)
     flight = recording("paper-constrained")
     for host in (usual, small):
         host.reset(flight.before)

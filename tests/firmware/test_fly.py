@@ -77,7 +77,8 @@ def test_commands_in_the_page_have_the_bits_of_the_native_ones(tab: Any, name: s
     if degrees != 5.0:
         bounds = {f"controller.output_bounds.{angle}": [-degrees, degrees] for angle in ("roll", "pitch")}
         scenario = scenario.replace(bounds)
-    host, recording = Host(scenario), record(scenario)
+    host = Host(scenario)
+    recording = record(scenario)
     native = [[reply.status, reply.changes, *reply.command] for reply in replay(host, recording)]
     recorded = (recording.before, recording.state, recording.acting, recording.path)
     answers = tab.evaluate(COMMANDS, [name, degrees, *(array.tolist() for array in recorded)])

@@ -34,7 +34,8 @@ CONTROLLERS = {
 def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
     scenario, *settings = CONTROLLERS[name]
-    directory, program = exported("posix", *settings, scenario=scenario), tmp_path / "fuzz"
+    directory = exported("posix", *settings, scenario=scenario)
+    program = tmp_path / "fuzz"
     define = [*defines_of(directory), "-I", directory]
     compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, *define]
     built = run(*compile, "-o", program, HERE / "fuzz.c", *sources_of(directory), check=False)

@@ -133,7 +133,8 @@ def test_sanitizers_find_nothing_in_recorded_periods(exported: Exported, run: Ru
 def test_arbitrary_bytes_lead_to_commands_within_bounds(
     precision: Precision, exported: Exported, run: Run, tmp_path: Path
 ) -> None:
-    directory, program = exported("fed forward", precision), tmp_path / "fuzz"
+    directory = exported("fed forward", precision)
+    program = tmp_path / "fuzz"
     flags = ["-g", "-O1", "-std=c99", *SANITIZERS, *defines_of(directory), "-DMOST_CHANGES=0", "-I", directory]
     built = run("clang", *flags, "-o", program, HERE / "fuzz.c", *(directory / name for name in SOURCES), check=False)
     if "cannot find" in built.stderr:
@@ -146,9 +147,13 @@ def test_without_an_answer_the_contract_flies(run: Run) -> None:
     """A reference that is none, then no measurement: the plan that was kept, hover, the descent, all within bounds."""
     run("cc", "--version")
     scenario = scenario_of("plain")
-    host, source = Host(scenario), c_controller(scenario)
-    weight, state = Assembly(scenario).vehicle.mass * 9.81, make_state(position=(0.3, 0.0, 2.0))
-    command, place, levels = np.array([weight, 0.0, 0.0, 0.0]), np.tile([0.0, 0.0, 2.0, 0.0], (source.horizon, 1)), []
+    host = Host(scenario)
+    source = c_controller(scenario)
+    weight = Assembly(scenario).vehicle.mass * 9.81
+    state = make_state(position=(0.3, 0.0, 2.0))
+    command = np.array([weight, 0.0, 0.0, 0.0])
+    place = np.tile([0.0, 0.0, 2.0, 0.0], (source.horizon, 1))
+    levels = []
     host.reset(command)
     for k in range(1400):
         reference = place if k < 20 else np.full_like(place, np.nan)

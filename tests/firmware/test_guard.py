@@ -59,7 +59,9 @@ class Told:
     failure: str | None = None
 
     def __post_init__(self) -> None:
-        self.name, self.solver, self.horizon = self.law.name, self.law.solver, self.law.horizon
+        self.name = self.law.name
+        self.solver = self.law.solver
+        self.horizon = self.law.horizon
 
     def reset(self, speeds: Array) -> None:
         self.law.reset(speeds)
@@ -80,8 +82,11 @@ class Vehicle:
     """A vehicle that moves as the hover model does under a constant force, measured with noise and with faults."""
 
     def __init__(self, model: LinearModel, seed: int) -> None:
-        self.rng, self.state, self.measured = np.random.default_rng(seed), np.zeros(12), np.zeros(12)
-        self.model, self.speeds = model, model.u_bar
+        self.rng = np.random.default_rng(seed)
+        self.state = np.zeros(12)
+        self.measured = np.zeros(12)
+        self.model = model
+        self.speeds = model.u_bar
         self.state[INDEX["yaw"]] = 0.4
         more = np.array([0.3, 0.0, 0.0, 0.0] if model.targets else [3.0, 4.0, 3.0, 2.0])
         self.trim = Trim(speeds=self.speeds + more, lift=np.array([-0.2, 0.1, 9.81]))
@@ -91,7 +96,8 @@ class Vehicle:
 
     def measure(self, k: int, frozen: Mapping[int, tuple[int, ...]], missing: Mapping[int, tuple[int, ...]]) -> Array:
         """The state in period k; `frozen` and `missing` channels by period, the latter by turns in three ways."""
-        before, self.measured = self.measured, self.state + 1e-3 * self.rng.normal(size=12)
+        before = self.measured
+        self.measured = self.state + 1e-3 * self.rng.normal(size=12)
         self.measured[[*frozen.get(k, ())]] = before[[*frozen.get(k, ())]]
         seen = self.measured.copy()
         seen[[*missing.get(k, ())]] = (math.nan, math.inf, -1e7)[k % 3]
@@ -104,27 +110,35 @@ def over(channels: tuple[int, ...], *spans: range) -> dict[int, tuple[int, ...]]
 
 def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command], list[Reply]]:
     """Commands in flight and of the exported law to the same measurements, while the vehicle flies the former."""
-    table, period = scenario.controller, scenario.control_period
+    table = scenario.controller
+    period = scenario.control_period
     linear = not isinstance(table, Nonlinear)
     pilot = Assembly(scenario.replace({"controller.solver": CORE} if linear else {})).controller()
     guard = table.guard(Assembly(scenario).vehicle, period)
     assert guard is not None
     assert isinstance(pilot.law, LinearMPC | NonlinearMPC)
     vehicle = Vehicle(guard.model, seed)
-    law, everything = Told(pilot.law), tuple(range(12))
+    law = Told(pilot.law)
+    everything = tuple(range(12))
     law.reset(guard.reset(vehicle.speeds))
     host.reset(vehicle.speeds)
     frozen = over(VELOCITY, range(28, 34)) | over(EULER_RATE, range(36, 40)) | over(POSITION + EULER, range(44, 48))
     missing = over(POSITION, range(52, 56), range(150, 160)) | over(everything, range(60, 63), range(80, 96))
     missing |= over((INDEX["vx"], INDEX["roll"], INDEX["yaw_rate"]), range(100, 106))
     path = np.zeros((PERIODS + law.horizon, 4))
-    path[62:66, 0], path[125:129, 1], path[110:, 3], path[190:, 2] = 3.0, 2.0, 1.0, 0.3
+    path[62:66, 0] = 3.0
+    path[125:129, 1] = 2.0
+    path[110:, 3] = 1.0
+    path[190:, 2] = 0.3
     path += [0.0, 0.0, 0.0, 0.4]
-    commands, replies = list[Command](), list[Reply]()
+    commands = list[Command]()
+    replies = list[Reply]()
     for k in range(PERIODS):
         if k in (130, 170):
             vehicle.state[[INDEX["vz"], INDEX["vx"]]] += [2.0, 1.0]  # beyond a hard bound: infeasible
-        seen, reference, acting = vehicle.measure(k, frozen, missing), path[k : k + law.horizon].copy(), vehicle.speeds
+        seen = vehicle.measure(k, frozen, missing)
+        reference = path[k : k + law.horizon].copy()
+        acting = vehicle.speeds
         reference[0, 1] = math.nan if k in (66, 67) else 1e6 if k == 68 else reference[0, 1]
         acting = np.full(4, math.nan) if k == 24 else np.full(4, 2e6) if k == 25 else acting
         phase = PHASES[2 if k in (0, 225, 226, 227) else 1 if k in (1, 2, 228) else 0]
@@ -200,8 +214,10 @@ def test_bounds_of_the_table_are_those_of_the_problem(name: str) -> None:
 
 def test_a_law_without_a_contract_in_flight_has_one_on_a_computer() -> None:
     """`unconstrained` hovers level where its state is unknown, and sinks after 5 s."""
-    host, period = Host(load_scenario("paper-unconstrained")), load_scenario("paper-unconstrained").control_period
-    reference, hover = np.zeros((host.horizon, 4)), np.full(4, 192.8)
+    host = Host(load_scenario("paper-unconstrained"))
+    period = load_scenario("paper-unconstrained").control_period
+    reference = np.zeros((host.horizon, 4))
+    hover = np.full(4, 192.8)
     host.reset(hover)
     assert host.step(np.zeros(12), reference, hover).fallback == 0
     levels = [host.step(np.full(12, math.nan), reference, hover).fallback for _ in range(round(8.0 / period))]

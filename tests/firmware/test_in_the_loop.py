@@ -38,7 +38,8 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
     short = load_scenario(scenario, ["duration=6.0"])
     linear = scenario in ("paper-constrained", "robust")
     exact = short.replace({"controller.solver": "core"}) if linear else short
-    result, desired = fly_exported(short, target=target, precision=precision, progress=False), Rollout(exact).fly()
+    result = fly_exported(short, target=target, precision=precision, progress=False)
+    desired = Rollout(exact).fly()
     assert result.log.control.status == desired.log.control.status
     assert np.abs(result.command - desired.command).max() <= apart
     assert [finding.satisfied for finding in result.findings] == [finding.satisfied for finding in desired.findings]

@@ -49,7 +49,10 @@ class Autopilot:
     """The other end: numbers its questions, and can corrupt them."""
 
     def __init__(self, line: Terminal, recorded: Recording) -> None:
-        self.line, self.recorded, self.frames, self.number = line, recorded, Frames("double"), 0
+        self.line = line
+        self.recorded = recorded
+        self.frames = Frames("double")
+        self.number = 0
 
     def question(self, kind: QueryKind, row: Array, k: int = 0) -> bytes:
         self.number += 1
@@ -113,7 +116,8 @@ def test_a_doubled_question_is_solved_once_and_answered_twice(terminal: Terminal
     pilot.start()
     for k in range(10):
         frame = pilot.period(k)
-        first, again = pilot.send(frame + frame), pilot.hear_last()
+        first = pilot.send(frame + frame)
+        again = pilot.hear_last()
         assert first.number == again.number == pilot.number
         assert np.array_equal(first.command, again.command)
         assert np.abs(first.command - recorded.command[k]).max() <= 1e-8  # a second step would have moved the window on
@@ -121,7 +125,8 @@ def test_a_doubled_question_is_solved_once_and_answered_twice(terminal: Terminal
 
 def test_corrupt_and_truncated_frames_are_dropped(terminal: Terminal, recorded: Recording) -> None:
     """Bits turned, ends missing, noise between frames, and noise that begins as a frame does."""
-    pilot, draw = Autopilot(terminal, recorded), random.Random(1)
+    pilot = Autopilot(terminal, recorded)
+    draw = random.Random(1)
     pilot.start()
     for k in range(12):
         frame = bytearray(pilot.period(k))
@@ -167,7 +172,8 @@ def test_without_a_fresh_state_the_last_command_is_repeated(terminal: Terminal, 
     pilot = Autopilot(terminal, recorded)
     pilot.start()
     desired = pilot.send(pilot.period(0))
-    heard, started = [pilot.hear()], clock.monotonic()
+    heard = [pilot.hear()]
+    started = clock.monotonic()
     while len(heard) < 5:
         heard.append(pilot.hear())
     assert 0.35 <= clock.monotonic() - started <= 3.0  # 0.4 s, and a busy machine

@@ -48,7 +48,8 @@ def test_compilers_give_no_warning(
 
 def test_files_of_two_precisions_do_not_make_a_program(exported: Export, run: Run, tmp_path: Path) -> None:
     """Their memory differs: neither the numbers nor the core may be of the other."""
-    directory, core = exported("posix", "double"), tmp_path / "core.o"
+    directory = exported("posix", "double")
+    core = tmp_path / "core.o"
     done = run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "main.c", "-o", tmp_path / "main.o", check=False)
     assert "this export is of doubles" in done.stderr
     run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "quadsim_core.c", "-o", core)
@@ -118,7 +119,8 @@ FAULTS = {
 def test_planted_faults_are_detected(fault: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """Each trap that exported C could fall into: recursion, allocation, doubles, numbers too small and others."""
     tool, body, finding = FAULTS[fault]
-    source, header = tmp_path / "planted.c", exported("cortex-m4f", "float")
+    source = tmp_path / "planted.c"
+    header = exported("cortex-m4f", "float")
     source.write_text(PLANTED.format(body=body.format()))
     include = f"-I{header}"
     if tool == "nm":

@@ -94,7 +94,8 @@ def bits(found: list[Answer]) -> list[Answer]:
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_board_starts_counts_and_stops(board: str, exported: Export, run: Run, tmp_path: Path) -> None:
-    target, directory = TARGETS[board], exported(board, "double")
+    target = TARGETS[board]
+    directory = exported(board, "double")
     flags = f"{target.machine} -O3 -std=gnu99 -I {directory}".split()
     image = tmp_path / "bare.elf"
     link = f"-nostartfiles -T {directory / 'mps2.ld'} --specs=nano.specs".split()
@@ -185,7 +186,8 @@ def test_a_step_takes_few_instructions(
 def test_a_controller_fits(
     law: str, board: str, precision: str, exported: Export, run: Run, measured: Measured, tmp_path: Path
 ) -> None:
-    directory, tools = exported(board, precision, scenario=law), "arm-none-eabi-size"
+    directory = exported(board, precision, scenario=law)
+    tools = "arm-none-eabi-size"
     run(TARGETS[board].compiler, "--version")
     make_program(directory, "vectors.elf")
     numbers = tmp_path / "numbers.c"
@@ -213,7 +215,8 @@ def test_a_controller_fits(
 def test_the_stack_is_small(board: str, precision: str, law: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """Painted below main, and looked at after all recorded periods."""
     directory = exported(board, precision, scenario=law)
-    target, image = TARGETS[board], tmp_path / "stack.elf"
+    target = TARGETS[board]
+    image = tmp_path / "stack.elf"
     sources = [*sources_of(directory), *(directory / f"{name}.c" for name in ("vectors", "startup"))]
     flags = (
         f"{target.machine} {' '.join(defines_of(directory))} -O3 -std=gnu99 -ffp-contract=off -I {directory}".split()

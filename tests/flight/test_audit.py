@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support import logged, small_log
+from support import small_log
 
 from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled, worst_finding, worst_share
 from quadsim.flight.log import FlightLog
@@ -19,6 +20,22 @@ Z = Limit(name="height", signal="z", lower=-1.0, upper=2.0)
 SAMPLES = (0.0, 1.0, 1.9)
 PLANT = (0.0, 0.5, 1.0, 2.5, 1.9, -1.25, 0.0)
 """Twice per 0.1 s period; beyond the upper bound at t = 0.15 s by 0.5, beyond the lower at t = 0.25 s by 0.25."""
+
+
+def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float]) -> FlightLog:
+    """A made-up flight where one state is as given, in its own unit, and all else is zero.
+
+    One sample per 0.1 s; plant rows spread evenly, the first at t = 0, the last at the end of the last period.
+    """
+    steps, rest = divmod(len(plant) - 1, len(samples))
+    assert rest == 0, "plant rows must be a whole number per period, plus one"
+    log = small_log(len(samples), steps=steps)
+    state = np.zeros_like(log.control.state)
+    control = replace(log.control, state=state, truth=state, reference=np.zeros_like(log.control.reference))
+    flown = replace(log.plant, state=np.zeros_like(log.plant.state))
+    control.state[:, INDEX[state_name]] = samples
+    flown.state[:, INDEX[state_name]] = plant
+    return replace(log, control=control, plant=flown)
 
 
 def find(log: FlightLog, limit: Limit) -> Finding:
@@ -167,7 +184,8 @@ def test_steps_of_the_command_are_audited_from_the_first_on() -> None:
 
 def test_the_worst_finding_is_a_required_one_unless_none_is() -> None:
     log = logged("z", samples=SAMPLES, plant=PLANT)
-    tight, roomy = replace(Z, name="tight", required=False), replace(Z, name="roomy", lower=-9.0, upper=9.0)
+    tight = replace(Z, name="tight", required=False)
+    roomy = replace(Z, name="roomy", lower=-9.0, upper=9.0)
     assert worst_finding(audit(log, (tight, roomy))) == find(log, roomy)
     assert worst_finding(audit(log, (tight, replace(roomy, required=False)))) == find(log, tight)
 

@@ -17,7 +17,8 @@ from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array, t
 from quadsim.vehicle import Vehicle
 
 PERIOD = 0.01
-ROLL, PITCH = INDEX["roll"], INDEX["pitch"]
+ROLL = INDEX["roll"]
+PITCH = INDEX["pitch"]
 
 
 def demanded(
@@ -44,7 +45,8 @@ def test_hover_requires_the_hover_speed_and_nothing_else(vehicle: Vehicle) -> No
 
 def test_a_circle_requires_the_tilt_of_its_centripetal_acceleration(vehicle: Vehicle) -> None:
     """tan(tilt) = v^2 / (r g), where v^2 / r of a sampled circle is r (2 - 2 cos(w h)) / h^2."""
-    radius, rate = 2.0, 1.2
+    radius = 2.0
+    rate = 1.2
     _, result = demanded(vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, 0.0 * t))
     sampled = radius * (2.0 - 2.0 * math.cos(rate * PERIOD)) / PERIOD**2
     np.testing.assert_allclose(tilt(result.state), math.atan(sampled / vehicle.gravity), rtol=1e-9)
@@ -95,7 +97,8 @@ def test_the_demand_at_a_jump_is_left_out(vehicle: Vehicle) -> None:
     poses = np.zeros((14, 4))
     poses[7:, 0] = 1.0
     jumps = np.arange(13) == 6
-    left_out, counted = demand(poses, PERIOD, vehicle, jumps=jumps), demand(poses, PERIOD, vehicle)
+    left_out = demand(poses, PERIOD, vehicle, jumps=jumps)
+    counted = demand(poses, PERIOD, vehicle)
     assert np.abs(counted.acceleration).max() == pytest.approx(1.0 / PERIOD**2)
     assert np.flatnonzero(counted.acceleration[:, 0]).tolist() == [4, 5]
     assert not left_out.acceleration.any()

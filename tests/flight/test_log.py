@@ -45,7 +45,8 @@ def test_a_flight_comes_back_bit_for_bit_and_equal_ones_give_equal_bytes(tmp_pat
         write(tmp_path / name, log)
     back = read_log(tmp_path / "a", reason=log.reason)
     for part in ("control", "timing", "plant"):
-        one, other = getattr(back, part), getattr(log, part)
+        one = getattr(back, part)
+        other = getattr(log, part)
         for field in dataclasses.fields(one):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
     np.testing.assert_array_equal(back.predicted, log.predicted)

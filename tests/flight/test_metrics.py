@@ -20,8 +20,10 @@ from quadsim.state import Array
 def control(z: list[float], reference: list[float]) -> ControlLog:
     """A log where z [m] and its reference are as given and all else is zero."""
     log = small_log(len(z)).control
-    state, desired = np.zeros_like(log.state), np.zeros_like(log.reference)
-    state[:, 4], desired[:, 2] = z, reference
+    state = np.zeros_like(log.state)
+    desired = np.zeros_like(log.reference)
+    state[:, 4] = z
+    desired[:, 2] = reference
     return replace(log, truth=state, reference=desired)
 
 
@@ -77,7 +79,8 @@ def settled(t: Array, x: Array, *, before: float, after: float, start: float = 0
 @pytest.mark.parametrize(("before", "after"), [(0.0, 10.0), (3.0, -1.0)])
 def test_a_first_order_response_settles_after_tau_ln_20(tau: float, before: float, after: float) -> None:
     """exp(-t / tau) = 0.05 at t = tau ln 20, whatever the step; the first sample from then on counts."""
-    period, start = 0.05, 2.0
+    period = 0.05
+    start = 2.0
     t = np.arange(400) * period
     x = np.where(t < start, before, after + (before - after) * np.exp(-(t - start) / tau))
     expected = period * math.ceil(tau * math.log(20.0) / period)
@@ -94,7 +97,8 @@ def test_an_output_that_leaves_the_band_again_has_not_settled_before() -> None:
 
 
 def test_a_flight_that_ended_before_has_not_settled() -> None:
-    t, x = np.arange(5.0), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    t = np.arange(5.0)
+    x = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
     assert settled(t, x, before=0.0, after=1.0, until=5.0) == 1.0
     assert settled(t, x, before=0.0, after=1.0, until=6.0) is None
     assert settled(t, x, before=0.0, after=1.0, start=7.0, until=9.0) is None
@@ -104,7 +108,9 @@ def test_a_flight_that_ended_before_has_not_settled() -> None:
 
 def test_peak_tilt_is_the_larger_of_roll_and_pitch() -> None:
     state = np.zeros((3, 12))
-    state[1, 6], state[2, 8], state[2, 10] = math.radians(3.0), math.radians(-7.0), 2.0
+    state[1, 6] = math.radians(3.0)
+    state[2, 8] = math.radians(-7.0)
+    state[2, 10] = 2.0
     assert metrics.peak_tilt(state) == pytest.approx(7.0)
 
 
@@ -160,7 +166,8 @@ def test_fallback_for_good_is_the_last_second_at_least_or_the_whole_flight(level
     assert metrics.unrecovered(log) == expected
 
 
-GROUND, UP = [Phase.LANDED] * 10, [Phase.ARMED] * 30
+GROUND = [Phase.LANDED] * 10
+UP = [Phase.ARMED] * 30
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,8 @@ def test_clearance_level_and_tilted() -> None:
 
 def test_clearance_is_that_of_the_lowest_point() -> None:
     rng = np.random.default_rng(0)
-    states, points = rng.normal(size=(20, 12)), rng.normal(size=(7, 3))
+    states = rng.normal(size=(20, 12))
+    points = rng.normal(size=(7, 3))
     heights = [state[list(POSITION)] + points @ body_to_world(state[[6, 8, 10]]).T for state in states]
     lowest = np.array([points_world[:, 2].min() for points_world in heights])
     np.testing.assert_allclose(clearance(states, points, 0.1, 0.2), lowest - 0.3, atol=1e-12)
@@ -83,7 +84,8 @@ def test_tilt_is_the_angle_from_the_vertical(roll: float, pitch: float, expected
 
 
 def test_a_flight_from_the_ground_to_the_ground(monitor: PhaseMonitor) -> None:
-    ground, up = to(0.0), to(1.0)
+    ground = to(0.0)
+    up = to(1.0)
     flight = [(at(0.0), ground)] * 2 + [(at(0.0), up)] * 2 + [(at(0.04), up), (at(0.06), up), (at(1.0), up)]
     assert phases(monitor, flight) == ["landed"] * 2 + ["armed"] * 3 + ["flying"] * 2
     down = [(at(1.0), ground), (at(0.03), ground)] + [(at(-2e-4), ground)] * 5
@@ -140,7 +142,8 @@ def test_feet_that_touch_at_a_steep_tilt_are_a_crash(roll: float, crashed: bool)
     outline = Outline(feet=FEET, foot_radius=RADIUS, hull=np.array([[0.0, 0.0, 0.5]]), floor=FLOOR, disc=0.03)
     state = at(0.0, roll=roll)
     state[INDEX["z"]] -= clearance(state[None], FEET, RADIUS, FLOOR)[0]
-    touching, free = state, state + np.eye(12)[INDEX["z"]]
+    touching = state
+    free = state + np.eye(12)[INDEX["z"]]
     assert (
         PhaseMonitor(outline, period=PERIOD).advance(np.zeros(1), touching[None], to(1.0)) is Phase.CRASHED
     ) is crashed
@@ -163,7 +166,8 @@ def hop(peak: float) -> tuple[Array, Array, Array]:
     states = np.tile(at(0.0, pitch=3.0), (t.size, 1))
     states[:, INDEX["z"]] = up * since - 4.905 * since**2
     states[:, INDEX["vz"]] = np.where(inside, up - 9.81 * since, 0.0)
-    states[inside, INDEX["vx"]], states[inside, INDEX["vy"]] = 0.3, -0.4
+    states[inside, INDEX["vx"]] = 0.3
+    states[inside, INDEX["vy"]] = -0.4
     return t, states, states[:, INDEX["z"]].copy()
 
 
@@ -171,7 +175,8 @@ def test_take_off_and_touchdown_of_a_ballistic_hop() -> None:
     """It falls from 0.8 m to within a touch of the ground: v^2 = 2 g (0.8 m - TOUCH), to a step's 0.01 m/s."""
     t, states, clearances = hop(0.8)
     expected = np.sqrt(2.0 * 9.81 * (0.8 - TOUCH))
-    start, rise = 0.5, np.sqrt(2.0 * 9.81 * 0.8)
+    start = 0.5
+    rise = np.sqrt(2.0 * 9.81 * 0.8)
     result = touchdown(t, states, clearances)
     assert result is not None
     assert result["time"] == pytest.approx(start + (rise + expected) / 9.81, abs=1.01e-3)
@@ -289,7 +294,8 @@ def test_the_lead_is_bounded_and_waits_for_thrust_that_does_not_follow() -> None
 
 
 def test_the_lead_fades_with_the_climb_and_never_grows_in_the_air() -> None:
-    slow, course = TakeoffLead(PERIOD), 2.0
+    slow = TakeoffLead(PERIOD)
+    course = 2.0
     pushed(slow, WAITING + 1)
     first = pushed(slow, 20, thrust=1.1, more=0.02)
     assert [slow.fade(0.0, course), slow.fade(-0.1, course)] == [first, first]

@@ -25,7 +25,9 @@ from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
 from quadsim.state import INDEX, POSITION, Array
 from quadsim.vehicle import Vehicle
 
-N, PERIOD, RADIUS = 30, 0.05, 0.4
+N = 30
+PERIOD = 0.05
+RADIUS = 0.4
 PILLAR = Cylinder(name="pillar", position=(1.0, 0.45, 0.0), radius=0.2, height=5.0)
 FENCE = Fence(position=(0.0, 0.0, 0.0), size=(9.0, 1.8, 3.0))
 
@@ -46,7 +48,8 @@ def space(*shapes: Shape, soft: bool = False, horizon: int = N, **given: float) 
 
 def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
     """Flying along x towards a goal."""
-    state, reference = np.zeros(12), np.zeros((N, 4))
+    state = np.zeros(12)
+    reference = np.zeros((N, 4))
     state[INDEX["vx"]] = speed
     reference[:, 0] = goal
     return Query(state, problem.desired(reference), problem.model.u_bar)
@@ -73,7 +76,8 @@ def positions(problem: Problem, posed: Query, answer: Answer) -> Array:
 
 def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -> Array:
     """The plan (N, nu) of the condensed QP with hard half-spaces (S, N, 3), (S, N) as rows of its own."""
-    form, maps = Condensed(problem), prediction(problem.model, N)
+    form = Condensed(problem)
+    maps = prediction(problem.model, N)
     qp = form.assemble(Query(*posed[:3]))
     chosen = np.zeros((len(bounds), N, N * 12))
     for i in range(N):
@@ -126,7 +130,8 @@ def test_regions_are_exact_and_hold_in_their_window() -> None:
 
 
 def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
-    among, posed = space(PILLAR, FENCE, rows=7), query(problem)
+    among = space(PILLAR, FENCE, rows=7)
+    posed = query(problem)
     result = clearing(problem, among).solve(0.0, posed)
     assert result[0].status == SOLVED
     free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)
@@ -139,7 +144,9 @@ def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
 
 
 def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) -> None:
-    posed, few, many = query(problem), space(PILLAR, FENCE, rows=1), space(PILLAR, FENCE, rows=7)
+    posed = query(problem)
+    few = space(PILLAR, FENCE, rows=1)
+    many = space(PILLAR, FENCE, rows=7)
     ours, whole = (clearing(problem, among).solve(0.0, posed) for among in (few, many))
     np.testing.assert_allclose(ours[0].plan, whole[0].plan, atol=2e-3)
     normals, bounds = few.half_spaces(
@@ -174,12 +181,14 @@ def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
     assert result[0].plan is calls[1].plan
     result = clearing(problem, space(comes, soft=True, iterations=20), calls).solve(0.0, query(problem))
     assert result[0].plan is not calls[2].plan
-    t, places = PERIOD * np.arange(1, N + 1), positions(problem, query(problem), result[0])
+    t = PERIOD * np.arange(1, N + 1)
+    places = positions(problem, query(problem), result[0])
     assert comes.clearance(t, places).min() > RADIUS - 1e-3
 
 
 def test_axes_turned_by_a_yaw_make_no_difference(problem: Problem) -> None:
-    posed, yaw = query(problem), 0.3
+    posed = query(problem)
+    yaw = 0.3
     turned = replace(PILLAR, position=(np.cos(yaw) - 0.45 * np.sin(yaw), np.sin(yaw) + 0.45 * np.cos(yaw), 0.0))
     plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
     ours = clearing(problem, space(turned)).solve(0.0, posed, yaw)

@@ -45,8 +45,12 @@ def coupled(problem: Problem, given: Period, *, soft: bool, share: float = 0.5, 
     the farthest that the optimum goes.
     """
     rng = np.random.default_rng(11)
-    m, n, nu = 3, 12, 4
-    C, D, E = rng.normal(size=(m, n)), 0.1 * rng.normal(size=(m, nu)), 0.1 * rng.normal(size=(m, nu))
+    m = 3
+    n = 12
+    nu = 4
+    C = rng.normal(size=(m, n))
+    D = 0.1 * rng.normal(size=(m, nu))
+    E = 0.1 * rng.normal(size=(m, nu))
     if problem.model.n > n:
         C = np.hstack([C, np.zeros((m, problem.model.n - n))])
     endless = np.full(m, math.inf)
@@ -54,10 +58,13 @@ def coupled(problem: Problem, given: Period, *, soft: bool, share: float = 0.5, 
     goes = ocp_peer.values(row, given, ocp_peer.optimum(problem, given).plan) - D @ problem.model.u_bar
     upwards = np.where(goes.max(axis=0) > -goes.min(axis=0), 1.0, -1.0) * [1.0, -1.0, 1.0]
     C, D, E = (upwards[:, None] * part for part in (C, D, E))
-    level, half = D @ problem.model.u_bar, share * np.abs(goes).max(axis=0)
+    level = D @ problem.model.u_bar
+    half = share * np.abs(goes).max(axis=0)
     assert np.all(half > 1e-2)
-    lower, upper = level - half, level + half
-    lower[0], upper[1] = -math.inf, math.inf
+    lower = level - half
+    upper = level + half
+    lower[0] = -math.inf
+    upper[1] = math.inf
     penalty = Penalty(l1=np.full(m, l1), l2=np.full(m, 0.5)) if soft else None
     return replace(row, C=C, D=D, E=E, lower=lower, upper=upper, penalty=penalty)
 
@@ -183,7 +190,9 @@ def test_rows_of_states_alone_are_held_axis_by_axis(soft: bool) -> None:
     quick = replace(problem.bounds, delta_min=np.full(4, -100.0), delta_max=np.full(4, 100.0))
     problem = replace(problem, bounds=quick)
     C = np.zeros((3, 12))
-    C[0, [1, 8]], C[1, [4, 5]], C[2, 11] = [1.0, 2.0], [0.2, 1.0], 1.0
+    C[0, [1, 8]] = [1.0, 2.0]
+    C[1, [4, 5]] = [0.2, 1.0]
+    C[2, 11] = 1.0
     penalty = Penalty(l1=np.full(3, 0.2), l2=np.full(3, 1.0)) if soft else None
     row = Constraint(
         name="speeds", C=C, lower=np.array([-0.2, -math.inf, -0.02]), upper=np.array([0.25, 0.1, 0.02]), penalty=penalty
@@ -253,7 +262,8 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     fields, drawn_in = SETTINGS[parts]
     table = robust_table(horizon=N, **fields)
     base = modelled(vehicle, table, drawn_in, ())
-    hover, reference = np.full(4, vehicle.hover_speed), np.tile([3.0, -2.0, 2.0, 0.3], (N, 1))
+    hover = np.full(4, vehicle.hover_speed)
+    reference = np.tile([3.0, -2.0, 2.0, 0.3], (N, 1))
     state = make_state(euler=(0.01, -0.02, 0.0))
     state[1] = 0.05
     x0 = np.concatenate([state, hover])[: base.model.n]

@@ -31,7 +31,8 @@ SLOW: Final = dict.fromkeys(("osqp", "proxqp", "clarabel", "quadprog"), 10)
 """Solvers that are called every so many periods only: qpsolvers sets them up anew each time."""
 MAY_FAIL: Final = frozenset(("osqp", "proxqp"))
 """Solvers that give up on some of the QPs, and report it."""
-ALLOWED_DIFFERENCE, ALLOWED_RESIDUAL = 1e-3, 1e-2
+ALLOWED_DIFFERENCE = 1e-3
+ALLOWED_RESIDUAL = 1e-2
 """Of what a solver calls solved: its first input from the reference [rad/s], and its worst KKT residual."""
 
 
@@ -48,7 +49,8 @@ class Verdict:
     @property
     def checks(self) -> tuple[Check, ...]:
         """Its first inputs and its residuals, and its failures unless they are its habit."""
-        name, peer = f"`{self.solver}`, {self.queried} QPs", PACKAGES[self.solver]
+        name = f"`{self.solver}`, {self.queried} QPs"
+        peer = PACKAGES[self.solver]
         checks = (
             Check(
                 what=f"{name}: first input",
@@ -76,10 +78,13 @@ def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Ar
         reference: (K, 4) first inputs to compare with [rad/s].
     """
     form = Condensed(problem) if name == QPOASES else find_solver(name).formulate(problem)
-    backend, every = Qpoases() if name == QPOASES else make_backend(name), SLOW.get(name, 1)
+    backend = Qpoases() if name == QPOASES else make_backend(name)
+    every = SLOW.get(name, 1)
     backend.setup(form.qp)
-    queried, expected_inputs = queries[::every], reference[::every]
-    differences, residuals = [], []
+    queried = queries[::every]
+    expected_inputs = reference[::every]
+    differences = []
+    residuals = []
     for query, expected in zip(queried, expected_inputs, strict=True):
         qp = form.assemble(query.posed)
         solution = backend.solve(qp)

@@ -18,9 +18,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MASS, GRAVITY, INERTIA, LARGEST_THRUST = 1.0, 9.81, (0.03, 0.03, 0.06), 20.0
+MASS = 1.0
+GRAVITY = 9.81
+INERTIA = (0.03, 0.03, 0.06)
+LARGEST_THRUST = 20.0
 _H: Final = 0.235 * math.sqrt(0.5)
-ROTORS_X, ROTORS_Y, REACTION = (_H, -_H, -_H, _H), (-_H, -_H, _H, _H), (-0.013, 0.013, -0.013, 0.013)
+ROTORS_X = (_H, -_H, -_H, _H)
+ROTORS_Y = (-_H, -_H, _H, _H)
+REACTION = (-0.013, 0.013, -0.013, 0.013)
 IPOPT: Final = {
     "ipopt.tol": 1e-11, "ipopt.constr_viol_tol": 1e-11, "ipopt.compl_inf_tol": 1e-11, "ipopt.dual_inf_tol": 1e-9,
     "ipopt.bound_relax_factor": 0.0, "ipopt.honor_original_bounds": "yes", "ipopt.mu_target": 0.0,
@@ -79,13 +84,19 @@ def rotation(q: cs.SX) -> cs.SX:
 
 def product(p: cs.SX, q: cs.SX) -> cs.SX:
     """The Hamilton product."""
-    a, u, b, v = p[0], p[1:4], q[0], q[1:4]
+    a = p[0]
+    u = p[1:4]
+    b = q[0]
+    v = q[1:4]
     return cs.vertcat(a * b - cs.dot(u, v), a * v + b * u + cs.cross(u, v))
 
 
 def slope(case: Case, body: cs.SX, rotors: cs.SX) -> cs.SX:
     """d(p, q, v, omega)/dt."""
-    q, v, omega, J = body[3:7], body[7:10], body[10:13], cs.DM(INERTIA)
+    q = body[3:7]
+    v = body[7:10]
+    omega = body[10:13]
+    J = cs.DM(INERTIA)
     thrusts = LARGEST_THRUST * (rotors * rotors if case.speeds else rotors)
     torque = cs.vertcat(
         cs.dot(cs.DM(ROTORS_Y), thrusts), -cs.dot(cs.DM(ROTORS_X), thrusts), cs.dot(cs.DM(REACTION), thrusts)
@@ -104,7 +115,8 @@ def following(case: Case, x: cs.SX, u: cs.SX) -> cs.SX:
     def rotors(t: float) -> cs.SX:
         return u + math.exp(-t / case.lag) * (x[13:] - u) if case.lag else u
 
-    h, body = case.node, x[:13]
+    h = case.node
+    body = x[:13]
     a = slope(case, body, rotors(0.0))
     b = slope(case, body + h / 2 * a, rotors(h / 2))
     c = slope(case, body + h / 2 * b, rotors(h / 2))
@@ -115,7 +127,8 @@ def following(case: Case, x: cs.SX, u: cs.SX) -> cs.SX:
 
 def residual(case: Case, x: cs.SX, x_r: cs.SX) -> cs.SX:
     """What a state's cost is the sum of the squares of."""
-    q, q_r = x[3:7], x_r[3:7]
+    q = x[3:7]
+    q_r = x_r[3:7]
     turned = q - q_r if case.difference else 2 * product(cs.vertcat(q_r[0], -q_r[1:4]), q)[1:4]
     return cs.vertcat(
         math.sqrt(case.position) * (x[:3] - x_r[:3]),
@@ -138,37 +151,51 @@ class Peer:
 
     def __init__(self, case: Case) -> None:
         self.case = case
-        N, n = case.nodes, case.n
-        X, U, x_r, u_r = cs.SX.sym("X", n, N + 1), cs.SX.sym("U", 4, N), cs.SX.sym("x_r", 13, N), cs.SX.sym("u_r", 4, N)
-        before, sides = cs.SX.sym("before", 4), 12 if case.tilt else 0
+        N = case.nodes
+        n = case.n
+        X = cs.SX.sym("X", n, N + 1)
+        U = cs.SX.sym("U", 4, N)
+        x_r = cs.SX.sym("x_r", 13, N)
+        u_r = cs.SX.sym("u_r", 4, N)
+        before = cs.SX.sym("before", 4)
+        sides = 12 if case.tilt else 0
         E = cs.SX.sym("E", 1, N) if any(case.penalty) else cs.SX(1, N)  # of the largest violation
-        cost, rows, lower, upper = cs.SX(0), [], [], []
+        cost = cs.SX(0)
+        rows = []
+        lower = []
+        upper = []
         for i in range(N):
             step = U[:, i] - (U[:, i - 1] if i else before)
             cost += case.input * cs.sumsqr(U[:, i] - u_r[:, i]) + case.move * cs.sumsqr(step)
             if i:
                 cost += cs.sumsqr(residual(case, X[:, i], x_r[:, i]))
             rows.append(X[:, i + 1] - following(case, X[:, i], U[:, i]))
-            lower, upper = lower + [0.0] * n, upper + [0.0] * n
+            lower = lower + [0.0] * n
+            upper = upper + [0.0] * n
             if case.steps:
                 rows.append(step)
-                lower, upper = lower + [-case.steps[i]] * 4, upper + [case.steps[i]] * 4
+                lower = lower + [-case.steps[i]] * 4
+                upper = upper + [case.steps[i]] * 4
             if sides:
-                axis, angles = rotation(X[3:7, i + 1])[:, 2], math.tau / sides * np.arange(sides)
+                axis = rotation(X[3:7, i + 1])[:, 2]
+                angles = math.tau / sides * np.arange(sides)
                 rows.append(cs.DM(np.cos(angles)) * axis[0] + cs.DM(np.sin(angles)) * axis[1] - E[0, i])
                 bound = math.sin(case.tilt) * math.cos(math.pi / sides)
-                lower, upper = lower + [-math.inf] * sides, upper + [bound] * sides
+                lower = lower + [-math.inf] * sides
+                upper = upper + [bound] * sides
                 l1, l2 = case.penalty
                 excess = E[0, i] / math.cos(case.tilt)  # sines to angles
                 cost += l1 * excess + l2 * excess**2
         w = cs.veccat(X, U, *([E] if any(case.penalty) else []))
         g = cs.vertcat(*rows)
-        p, at = cs.veccat(x_r, u_r, before), cs.SX.sym("at", w.shape)
+        p = cs.veccat(x_r, u_r, before)
+        at = cs.SX.sym("at", w.shape)
         there = cs.substitute(g, w, at)
         linear = there + cs.jtimes(there, at, w - at)
         self._whole = cs.nlpsol("whole", "ipopt", {"x": w, "p": p, "f": cost, "g": g}, IPOPT)
         self._linear = cs.nlpsol("linear", "ipopt", {"x": w, "p": cs.vertcat(p, at), "f": cost, "g": linear}, IPOPT)
-        self._rows, self._slacks = (lower, upper), w.numel() - (N + 1) * n - 4 * N
+        self._rows = (lower, upper)
+        self._slacks = w.numel() - (N + 1) * n - 4 * N
 
     def optimum(self, x0: Array, x_r: Array, u_r: Array, before: Array) -> Found:
         """From a state (n,) and an input (4,), towards states (N + 1, 13) and inputs (N, 4), which it starts at."""
@@ -184,7 +211,8 @@ class Peer:
         self, solver: cs.Function, plan: tuple[Array, Array], x0: Array, x_r: Array, u_r: Array, before: Array,
         *, along: bool,
     ) -> Found:  # fmt: skip
-        N, n = self.case.nodes, self.case.n
+        N = self.case.nodes
+        n = self.case.n
         guess = np.concatenate([plan[0].ravel(), plan[1].ravel(), np.zeros(self._slacks)])
         free = np.full(N * n, math.inf)
         low = np.concatenate([x0, -free, np.zeros(4 * N + self._slacks)])
@@ -192,5 +220,6 @@ class Peer:
         p = np.concatenate([x_r[:N].ravel(), u_r.ravel(), before, guess if along else []])
         result = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=self._rows[0], ubg=self._rows[1])
         w = result["x"].full().ravel()
-        states, inputs = w[: n * (N + 1)].reshape(N + 1, n), w[n * (N + 1) :][: 4 * N].reshape(N, 4)
+        states = w[: n * (N + 1)].reshape(N + 1, n)
+        inputs = w[n * (N + 1) :][: 4 * N].reshape(N, 4)
         return Found(states, inputs, bool(solver.stats()["success"]))

@@ -61,7 +61,8 @@ class ClosedLoop:
     @property
     def rmse(self) -> tuple[Quantity, ...]:
         """Tracking errors."""
-        ours, its = tracking(self.mujoco.control), tracking(self.rotorpy.control)
+        ours = tracking(self.mujoco.control)
+        its = tracking(self.rotorpy.control)
         return tuple(
             Quantity(name=f"RMS error {name}", unit=unit, mujoco=ours["rmse"][name], rotorpy=its["rmse"][name])
             for name, unit in ours["unit"].items()

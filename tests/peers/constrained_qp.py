@@ -43,10 +43,13 @@ class QpmpcController:
     """A problem of ours in qpmpc, solved anew for every query."""
 
     def __init__(self, problem: Problem) -> None:
-        model, bounds, objective = problem.model, problem.bounds, problem.objective
+        model = problem.model
+        bounds = problem.bounds
+        objective = problem.objective
         if bounds is None:
             raise ParameterError("controller", "bounds", None, "given: without any, there is no QP")
-        n, nu = model.n, model.nu
+        n = model.n
+        nu = model.nu
         weights = _diagonal("C_r' Q_y C_r", objective.C_r.T @ objective.Q_y @ objective.C_r)
         scales = np.where(weights > 0.0, np.sqrt(weights), UNWEIGHED)
         to_state = np.hstack([np.diag(1.0 / scales), np.zeros((n, nu))])  # xi = to_state x
@@ -76,7 +79,10 @@ class QpmpcController:
             stage_state_cost_weight=1.0,
             stage_input_cost_weight=1.0,
         )
-        self._scales, self._to_input, self._u_bar, self._C_r = scales, to_input, model.u_bar, objective.C_r
+        self._scales = scales
+        self._to_input = to_input
+        self._u_bar = model.u_bar
+        self._C_r = objective.C_r
 
     def solve(self, query: Query) -> Plan:
         """Qpmpc's plan, in its own coordinates."""
@@ -121,7 +127,8 @@ class ConstrainedQP:
 
 def measure(problem: Problem, queries: Sequence[Query]) -> ConstrainedQP:
     """Solve every query with both."""
-    peer, ours = QpmpcController(problem), QPSolver(OURS, problem)
+    peer = QpmpcController(problem)
+    ours = QPSolver(OURS, problem)
     plans = [peer.solve(query) for query in queries]
     speeds = np.array([peer.speeds(plan) for plan in plans])
     answers = np.array([ours.solve(query.posed).plan[0] for query in queries])

@@ -33,8 +33,10 @@ class DoMPC:
         from do_mpc.model import Model
 
         model = Model("discrete", "SX")
-        x, u = model.set_variable("_x", "x", (case.n, 1)), model.set_variable("_u", "u", (4, 1))
-        x_r, u_r = model.set_variable("_tvp", "x_r", (13, 1)), model.set_variable("_tvp", "u_r", (4, 1))
+        x = model.set_variable("_x", "x", (case.n, 1))
+        u = model.set_variable("_u", "u", (4, 1))
+        x_r = model.set_variable("_tvp", "x_r", (13, 1))
+        u_r = model.set_variable("_tvp", "u_r", (4, 1))
         model.set_rhs("x", following(case, x, u))
         model.setup()
         self._mpc = mpc = MPC(model)
@@ -42,7 +44,8 @@ class DoMPC:
         # The cost of the first state, which no input changes, is a constant.
         mpc.set_objective(lterm=cs.sumsqr(residual(case, x, x_r)) + case.input * cs.sumsqr(u - u_r), mterm=cs.DM(0))
         mpc.set_rterm(u=case.move)
-        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = 0.0, 1.0
+        mpc.bounds["lower", "_u", "u"] = 0.0
+        mpc.bounds["upper", "_u", "u"] = 1.0
         self._wanted = mpc.get_tvp_template()
         mpc.set_tvp_fun(lambda _: self._wanted)
         mpc.setup()
@@ -50,13 +53,15 @@ class DoMPC:
 
     def optimum(self, x0: Array, x_r: Array, u_r: Array, before: Array) -> Found:
         """From a state (n,) and an input (4,), towards states (N + 1, 13) and inputs (N, 4), which it starts at."""
-        mpc, N = self._mpc, self._case.nodes
+        mpc = self._mpc
+        N = self._case.nodes
         rotors = np.concatenate([u_r, u_r[-1:]]) if self._case.lag else np.zeros((len(x_r), 0))
         for i, state in enumerate(np.hstack([x_r, rotors])):
             mpc.opt_x_num["_x", i, 0, -1] = state
         for i in range(N):
             mpc.opt_x_num["_u", i, 0] = u_r[i]
-            self._wanted["_tvp", i, "x_r"], self._wanted["_tvp", i, "u_r"] = x_r[i], u_r[i]
+            self._wanted["_tvp", i, "x_r"] = x_r[i]
+            self._wanted["_tvp", i, "u_r"] = u_r[i]
         mpc.u0 = before
         mpc.make_step(x0.reshape(-1, 1))
         states = np.hstack([mpc.opt_x_num["_x", i, 0, -1].full() for i in range(N + 1)]).T

@@ -72,7 +72,9 @@ def riccati_gain(problem: Problem) -> Array:
 
 def infinite_gain(problem: Problem) -> Array:
     """(nu, n) the gain that scipy's solution of the discrete algebraic Riccati equation gives."""
-    A, B, R = problem.model.A, problem.model.B, problem.objective.Q_u
+    A = problem.model.A
+    B = problem.model.B
+    R = problem.objective.Q_u
     P = scipy.linalg.solve_discrete_are(A, B, _state_weight(problem), R)
     return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
 

@@ -72,7 +72,8 @@ class Course:
 
     def __init__(self, case: Case) -> None:
         scenario = load_scenario(COURSE)
-        self.case, self.vehicle = case, Assembly(scenario).vehicle
+        self.case = case
+        self.vehicle = Assembly(scenario).vehicle
         motion = Assembly(scenario).motion
         assert motion is not None
         self.motion: Motion = motion
@@ -80,7 +81,8 @@ class Course:
 
     def law(self, iterations: int = 1, tolerance: float | None = None) -> NonlinearMPC:
         """Our controller."""
-        case, largest = self.case, self.vehicle.speed_max
+        case = self.case
+        largest = self.vehicle.speed_max
         bounds = ActuatorBounds.of_vehicle(self.vehicle)
         if case.steps:
             bounds = ActuatorBounds.alike((0.0, largest), (-case.steps[0] * largest, case.steps[0] * largest))
@@ -102,12 +104,14 @@ class Course:
 
     def question(self, k: int, rng: np.random.Generator, before: Array | None, rotors: Array | None) -> Question:
         """A random state near the course at sample k, after an input, near the course's too where it is not given."""
-        case, motion = self.case, self.motion
+        case = self.case
+        motion = self.motion
         at = k + self.stride * np.arange(case.nodes + 1)
         states = np.hstack([motion.position, motion.attitude, motion.velocity, motion.body_rates])[at]
         inputs = motion.thrusts[at[:-1]] / 20.0
         inputs = np.sqrt(inputs) if case.speeds else inputs
-        x, turn = states[0].copy(), 0.2 * rng.normal(size=3)
+        x = states[0].copy()
+        turn = 0.2 * rng.normal(size=3)
         x[:3] += 0.3 * rng.normal(size=3)
         x[3:7] = _turned(x[3:7], turn)
         x[7:10] += 0.5 * rng.normal(size=3)
@@ -120,7 +124,8 @@ class Course:
     def plan(self, law: NonlinearMPC, question: Question, time: float) -> Array:
         """(N, 4) inputs that our controller answers."""
         state = np.zeros(N_STATES)
-        state[POSITIONS], state[VELOCITIES] = question.state[:3], question.state[7:10]
+        state[POSITIONS] = question.state[:3]
+        state[VELOCITIES] = question.state[7:10]
         moment = StepInputs(
             time=time,
             acting=self.speeds(question.before),
@@ -141,13 +146,15 @@ class Course:
 def _turned(q: Array, by: Array) -> Array:
     """The quaternion q after a rotation vector in the body frame."""
     angle = np.linalg.norm(by)
-    d, v = math.cos(angle / 2), math.sin(angle / 2) / angle * by
+    d = math.cos(angle / 2)
+    v = math.sin(angle / 2) / angle * by
     return np.concatenate([[q[0] * d - q[1:] @ v], q[0] * v + d * q[1:] + np.cross(q[1:], v)])
 
 
 def optima(case: Case, peer: Peer | DoMPC) -> Iterator[tuple[Found, Array]]:
     """A peer's optimum and our inputs (N, 4), converged, at random states along the course."""
-    course, rng = Course(case), np.random.default_rng(17)
+    course = Course(case)
+    rng = np.random.default_rng(17)
     law = course.law(iterations=300, tolerance=1e-9)
     for k in rng.integers(0, len(course.motion) - 50, STATES[case]).tolist():
         question = course.question(k, rng, None, None)
@@ -158,8 +165,11 @@ def optima(case: Case, peer: Peer | DoMPC) -> Iterator[tuple[Found, Array]]:
 
 def steps(case: Case) -> Iterator[tuple[Found, Array]]:
     """IPOPT's optimum of each period's QP, linearised along its own last plan, and our inputs (N, 4)."""
-    course, peer, rng = Course(case), Peer(case), np.random.default_rng(18)
-    law, first = course.law(), 300
+    course = Course(case)
+    peer = Peer(case)
+    rng = np.random.default_rng(18)
+    law = course.law()
+    first = 300
     before = rotors = course.question(first, rng, None, None).inputs[0]
     law.reset(course.speeds(before))
     plan = None
@@ -173,7 +183,8 @@ def steps(case: Case) -> Iterator[tuple[Found, Array]]:
             plan = start, np.clip(question.inputs, 0.0, 1.0)
         result = peer.step(plan, question.state, question.states, question.inputs, before)
         yield result, course.plan(law, question, PERIOD[case] * i)
-        plan, before = result[:2], result.inputs[0]
+        plan = result[:2]
+        before = result.inputs[0]
 
 
 def measure(case: Case) -> Agreement:
@@ -182,7 +193,8 @@ def measure(case: Case) -> Agreement:
     Raises:
         ArithmeticError: IPOPT did not solve a problem.
     """
-    whole, each = list(optima(case, Peer(case))), list(steps(case))
+    whole = list(optima(case, Peer(case)))
+    each = list(steps(case))
     if not all(result.solved for result, _ in (*whole, *each)):
         raise ArithmeticError(f"{case.name}: IPOPT did not solve every problem")
     differences = [np.array([np.abs(result.inputs - ours).max() for result, ours in pairs]) for pairs in (whole, each)]

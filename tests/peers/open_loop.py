@@ -92,7 +92,8 @@ def fly_rotorpy(vehicle: Vehicle, speeds: Array) -> Path:
     """Hold speeds (HOLDS, 4) [rad/s] from rest, each by one call of RotorPy's own `step`."""
     multirotor = make_multirotor(vehicle)
     state = {name: np.zeros(3) for name in ("x", "v", "w", "wind")} | {"q": np.array([0.0, 0.0, 0.0, 1.0])}
-    positions, quaternions = [], []
+    positions = []
+    quaternions = []
     for held in speeds:
         state = multirotor.step({**state, "rotor_speeds": held}, {"cmd_motor_speeds": held}, HOLD)
         positions.append(state["x"])

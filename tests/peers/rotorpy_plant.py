@@ -100,7 +100,8 @@ class RotorPyPlant:
                 euler_to_body_rates(euler, state[list(EULER_RATE)]),
             ]
         )
-        self._time, self._yaw = 0.0, float(euler[2])
+        self._time = 0.0
+        self._yaw = float(euler[2])
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
@@ -135,9 +136,13 @@ class RotorPyPlant:
         vectors = solution.y.T
         vectors[:, 6:10] /= np.linalg.norm(vectors[:, 6:10], axis=1, keepdims=True)
         physics = _to_physics(self._time + t, vectors)
-        self._time, self._vector = float(physics[-1, 0]), vectors[-1].copy()
+        self._time = float(physics[-1, 0])
+        self._vector = vectors[-1].copy()
         flown = np.empty(steps, steps_type())
-        flown["physics"], flown["speeds"], flown["commands"], flown["thrust"] = physics, held, held, math.nan
+        flown["physics"] = physics
+        flown["speeds"] = held
+        flown["commands"] = held
+        flown["thrust"] = math.nan
         return flown
 
 

@@ -21,7 +21,8 @@ def test_an_infeasible_qp_is_reported_and_harms_no_later_one(name: str, capfd: p
     problem = paper_problem()
     solver = QPSolver(name, problem)
     tilted = np.zeros(12)
-    tilted[6], tilted[7] = np.radians(30.0), 5.0
+    tilted[6] = np.radians(30.0)
+    tilted[7] = 5.0
     hovering = problem.desired(np.zeros((50, 4)))
     assert solver.solve(Query(tilted, hovering, problem.model.u_bar)).status in {"primal_infeasible", UNSOLVED}
     hover = solver.solve(Query(np.zeros(12), hovering, problem.model.u_bar))
@@ -33,7 +34,8 @@ def test_an_infeasible_qp_is_reported_and_harms_no_later_one(name: str, capfd: p
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_in_a_first_solve_is_printed(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     problem = paper_problem()
-    formulation, backend = find_solver(name).formulate(problem), make_backend(name)
+    formulation = find_solver(name).formulate(problem)
+    backend = make_backend(name)
     backend.setup(formulation.qp)
     desired = problem.desired(paper_reference(51)[1:])
     solution = backend.solve(formulation.assemble(Query(np.zeros(12), desired, problem.model.u_bar)))

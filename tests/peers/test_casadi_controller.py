@@ -28,8 +28,10 @@ def test_its_model_linearised_at_hover_is_ours() -> None:
     """But for the chain from a rotor to x, whose terms of third order in the period its one step has in part."""
     import casadi_mpc
 
-    vehicle, h = quadsim.load_vehicle("hummingbird"), 0.05
-    x, w = cs.SX.sym("x", 12), cs.SX.sym("w", 4)
+    vehicle = quadsim.load_vehicle("hummingbird")
+    h = 0.05
+    x = cs.SX.sym("x", 12)
+    w = cs.SX.sym("w", 4)
     after = casadi_mpc.after(vehicle, h, x, w)
     jacobians = cs.Function("jacobians", [x, w], [cs.jacobian(after, x), cs.jacobian(after, w), after])
     A, B, hover = (np.array(part) for part in jacobians(np.zeros(12), np.ones(4)))

@@ -31,7 +31,8 @@ def test_no_qp_was_solved_where_no_constraint_is_active(
 
 def test_a_reference_one_sample_late_is_seen(problem: Problem, queries: tuple[Query, ...]) -> None:
     """The index of the targets, which a constant reference would not show."""
-    peer, ours = QpmpcController(problem), QPSolver(OURS, problem)
+    peer = QpmpcController(problem)
+    ours = QPSolver(OURS, problem)
     late = [replace(query, desired=np.roll(query.desired, 1, axis=0)) for query in queries[::100]]
     differences = [
         np.abs(peer.speeds(peer.solve(wrong)) - ours.solve(query.posed).plan[0]).max()

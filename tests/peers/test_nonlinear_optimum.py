@@ -33,11 +33,15 @@ def test_optima_are_those_of_do_mpc(hold: Callable[[Check], None]) -> None:
 def test_do_mpc_is_given_the_same_problem() -> None:
     """With rotor lag, the error-state attitude, shares of speeds and a weight on moves."""
     case = replace(LAGGED, tilt=0.0, steps=(), penalty=(0.0, 0.0))
-    course, rng, whole, by_do_mpc = Course(LAGGED), np.random.default_rng(3), Peer(case), DoMPC(case)
+    course = Course(LAGGED)
+    rng = np.random.default_rng(3)
+    whole = Peer(case)
+    by_do_mpc = DoMPC(case)
     for k in (300, 400):
         question = course.question(k, rng, None, None)
         of = question.state, question.states, question.inputs, question.before
-        result, other = whole.optimum(*of), by_do_mpc.optimum(*of)
+        result = whole.optimum(*of)
+        other = by_do_mpc.optimum(*of)
         assert result.solved
         assert other.solved
         assert np.abs(result.inputs - other.inputs).max() < ALLOWED
@@ -46,7 +50,8 @@ def test_do_mpc_is_given_the_same_problem() -> None:
 
 def test_a_changed_weight_is_detected() -> None:
     """A hundredth more on the velocity: two thousand times what is allowed."""
-    course, other = Course(PAPER), Peer(replace(PAPER, velocity=1.01 * PAPER.velocity))
+    course = Course(PAPER)
+    other = Peer(replace(PAPER, velocity=1.01 * PAPER.velocity))
     question = course.question(300, np.random.default_rng(1), None, None)
     law = course.law(iterations=100, tolerance=1e-8)
     law.reset(course.speeds(question.before))

@@ -41,7 +41,8 @@ def test_both_fly_an_uneven_vehicle_the_same() -> None:
     """With products of inertia, and hubs anywhere; RotorPy's rotors have one thrust coefficient."""
     vehicle = replace(uneven(), thrust_coefficient=1.5e-5)
     speeds = open_loop.draw_speeds(vehicle, seed=0)
-    ours, peer = open_loop.fly_mujoco(vehicle, speeds, 1e-3), open_loop.fly_rotorpy(vehicle, speeds)
+    ours = open_loop.fly_mujoco(vehicle, speeds, 1e-3)
+    peer = open_loop.fly_rotorpy(vehicle, speeds)
     assert peer.tilt > np.radians(30.0)
     difference = open_loop.largest_difference([ours], [peer])
     assert max(difference.position, difference.attitude) < 1e-8

@@ -117,7 +117,7 @@ def test_the_conclusion_says_who_holds_and_who_is_closer_by_how_much(short_run: 
     same = "Both flights hold every constraint; position errors are equal: 0.25 m RMS."
     assert says(mine, judged(short_run, "twin", 0.25, roll=1.0, pitch=2.0)) == Cell(text=same, mark=Mark.GOOD)
     still = [judged(short_run, name, rmse, roll=1.0) for name, rmse in (("still", 1e-12), ("rest", 2e-12))]
-    assert says(*still).text == "Both flights hold every constraint; position errors are equal: < 1 nm RMS."
+    assert "position errors are equal: < 1 nm" in says(*still).text
     strict = dataclasses.replace(paper, findings=paper.findings[:1])
     assert says(mine, strict).text == f"Both flights hold their own constraints; {closer}"
     assert says(strict, wild).text.startswith("paper holds its own constraints, wild violates roll and pitch; ")
@@ -286,7 +286,9 @@ def test_a_verdict_is_compared_with_the_one_the_scenario_states(
 
 def test_a_verdict_minds_required_constraints_and_whether_they_were_reached(bare_run: Flight) -> None:
     finding = bare_run.findings[0]
-    missed, held, broken = unreached(finding, "arrival"), with_margin(finding, 1.0), with_margin(finding, -1.0)
+    missed = unreached(finding, "arrival")
+    held = with_margin(finding, 1.0)
+    broken = with_margin(finding, -1.0)
     reported = dataclasses.replace(missed, limit=dataclasses.replace(missed.limit, required=False))
     result = {
         "incomplete": [held, missed],

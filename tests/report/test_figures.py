@@ -56,8 +56,11 @@ def curves(panel: Panel) -> dict[str, Series]:
 
 def with_effects(run: Flight) -> Flight:
     """The flight as if it had met with wrench, wind, lagging rotors and errors of measurement."""
-    plant, control, rng = run.log.plant, run.log.control, np.random.default_rng(0)
-    wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
+    plant = run.log.plant
+    control = run.log.control
+    rng = np.random.default_rng(0)
+    wrench = rng.normal(size=(plant.t.size, 6))
+    wind = rng.normal(size=(plant.t.size, 3))
     plant = dataclasses.replace(plant, wrench=wrench, wind=wind, speeds=plant.speeds + 1.0)
     control = dataclasses.replace(control, state=control.state + 0.01)
     return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
@@ -85,7 +88,8 @@ def test_a_planar_course_is_drawn_from_above(short_run: Flight, tmp_path: Path) 
     run = flown(reference)
     assert write_figures(run, tmp_path)[-1].name == "xy.png"
     ((panel,),) = (figure.panels for figure in flight_figures.xy(run))
-    drawn, position = curves(panel), run.log.plant.state[:, POSITION]
+    drawn = curves(panel)
+    position = run.log.plant.state[:, POSITION]
     assert panel.equal
     assert [*drawn] == ["reference, filtered", "flight", "start", "end"]
     assert np.array_equal(drawn["reference, filtered"].y, reference[:, 1])
@@ -116,7 +120,8 @@ def test_another_scenario_gives_plain_names_and_its_effects(
 def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_run: Flight) -> None:
     result = panels(states([short_run]))
     assert list(result) == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
-    plant, control = short_run.log.plant, short_run.log.control
+    plant = short_run.log.plant
+    control = short_run.log.control
     np.testing.assert_array_equal(curves(result["z [m]"])["flight"].y, plant.state[:, INDEX["z"]])
     np.testing.assert_allclose(curves(result["pitch [deg]"])["flight"].y, np.degrees(plant.state[:, INDEX["pitch"]]))
     np.testing.assert_array_equal(curves(result["z [m]"])["reference, filtered"].y, control.reference[:, 2])
@@ -308,7 +313,8 @@ def test_the_legend_of_a_figure_as_wide_as_a_column_takes_a_sixth_of_it_at_most(
     canvas = draw(Figure(key="k", title="", panels=(Panel(title="x", series=curves),) * 2, columns=1), width=3.5)
     canvas.draw_without_rendering()
     (legend,) = canvas.legends
-    box, whole = legend.get_window_extent(), canvas.bbox
+    box = legend.get_window_extent()
+    whole = canvas.bbox
     assert box.height < whole.height / 6.0
     assert 0.0 <= box.x0 < box.x1 <= whole.width
 

@@ -42,8 +42,10 @@ def in_body(place: Array) -> Array:
 
 @EVERY
 def test_each_rotor_is_numbered_at_its_hub_and_says_where_it_is(vehicle: Vehicle) -> None:
-    axes, radius = drawn(vehicle), vehicle.rotor_radius or 0.5 * vehicle.closest_rotors
-    where, discs = texts(axes), [in_body(patch.get_xy()) for patch in axes.patches if patch.get_alpha() < 0.5]
+    axes = drawn(vehicle)
+    radius = vehicle.rotor_radius or 0.5 * vehicle.closest_rotors
+    where = texts(axes)
+    discs = [in_body(patch.get_xy()) for patch in axes.patches if patch.get_alpha() < 0.5]
     assert len(discs) == 4
     for number, (hub, disc) in enumerate(zip(vehicle.hubs, discs, strict=True), start=1):
         np.testing.assert_allclose(np.hypot(*(disc - hub[:2]).T), radius)
@@ -80,7 +82,8 @@ def test_arrows_turn_against_the_torque_that_the_rotors_give_the_body(vehicle: V
 @EVERY
 def test_front_axes_and_arms_point_as_the_body_does(vehicle: Vehicle) -> None:
     axes = drawn(vehicle)
-    where, lines = texts(axes), {line.get_color(): in_body(line.get_xydata()) for line in axes.get_lines()}
+    where = texts(axes)
+    lines = {line.get_color(): in_body(line.get_xydata()) for line in axes.get_lines()}
     for colour, direction in ((COLOUR.axis_x, (1.0, 0.0)), (COLOUR.axis_y, (0.0, 1.0))):
         start, end = lines[colour]
         np.testing.assert_array_equal(start, [0.0, 0.0])
@@ -103,7 +106,8 @@ def test_another_order_of_the_rotors_is_another_drawing() -> None:
         rotor_positions=tuple(vehicle.rotor_positions[i] for i in order),
         rotor_spins=tuple(vehicle.rotor_spins[i] for i in order),
     )
-    before, after = texts(drawn(vehicle)), texts(drawn(changed))
+    before = texts(drawn(vehicle))
+    after = texts(drawn(changed))
     np.testing.assert_array_equal(before["1"], after["2"])
     np.testing.assert_array_equal(before["2"], after["1"])
 

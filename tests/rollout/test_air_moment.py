@@ -26,7 +26,8 @@ from quadsim.rotation import euler_to_body_rates
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import ANGLE_RATES, ANGLES
 
-MOMENT, DAMPING = 1e-5, 5e-3
+MOMENT = 1e-5
+DAMPING = 5e-3
 VEHICLE = {"vehicle.rotor_moment": [MOMENT, MOMENT], "vehicle.rate_damping": [DAMPING] * 3}
 AIR = {"rotor_drag": 0.0, "body_drag": [1e-9] * 3}  # nothing but the moment
 FEEDFORWARD: dict[str, Any] = {"type": "geometric", "feedforward": True, "horizon": 20}
@@ -41,7 +42,8 @@ def figure_eight(**controller: Any) -> Scenario:
 
 def test_the_model_is_that_of_the_plant() -> None:
     """With rotors that turn alike, whatever the motion."""
-    vehicle, rng = quadsim.load_vehicle("hummingbird"), np.random.default_rng(3)
+    vehicle = quadsim.load_vehicle("hummingbird")
+    rng = np.random.default_rng(3)
     vehicle = replace(vehicle, rotor_moment=(2e-5, -3e-5), inflow_moment=(3e-3, -4e-3), rate_damping=(0.1, 0.2, 0.3))
     velocity, rates = rng.normal(size=(2, 3))
     expected = rotor_moment(vehicle, (2e-5, -3e-5), np.full(4, 400.0), Rotation.identity(), velocity, rates)
@@ -122,7 +124,8 @@ def rate_error(log: FlightLog) -> float:
 @pytest.mark.slow("air")
 def test_linear_mpc_takes_it_through_its_disturbance_also_in_wind() -> None:
     """Hovering in wind, J^-1 m W v is a constant torque: the observer finds it, and the offset disappears."""
-    wind, vehicle = (3.0, -2.0), quadsim.load_vehicle("hummingbird")
+    wind = (3.0, -2.0)
+    vehicle = quadsim.load_vehicle("hummingbird")
     hover = quadsim.load("hover").replace(
         {
             "vehicle": {"file": "hummingbird"},
@@ -138,7 +141,8 @@ def test_linear_mpc_takes_it_through_its_disturbance_also_in_wind() -> None:
             },
         }
     )
-    ends, found = [], np.empty(6)
+    ends = []
+    found = np.empty(6)
     for settings in ({}, {"controller.offset_free": {}}):
         with Rollout(hover.replace(settings)) as rollout:
             flight = rollout.fly()

@@ -68,8 +68,10 @@ def test_kkt_residuals_are_computed_as_often_as_stated(every: int) -> None:
 def test_infeasibility_is_the_largest_violation_of_a_row_step_by_step() -> None:
     """By the map and by prediction step by step, on plans that violate tilt, speed or slew."""
     problem = paper_problem()
-    rng, rows = np.random.default_rng(3), problem.rows
-    check, other = AnswerCheck(problem, 1), AnswerCheck(paper_problem("paper-constrained", "controller.horizon=50"), 1)
+    rng = np.random.default_rng(3)
+    rows = problem.rows
+    check = AnswerCheck(problem, 1)
+    other = AnswerCheck(paper_problem("paper-constrained", "controller.horizon=50"), 1)
     solver = QPSolver("piqp-multistage", problem)
     for size in (0.0, 0.3, 3.0, 100.0):
         query = Query(0.01 * rng.normal(size=12), np.zeros((50, 4)), problem.model.u_bar)

@@ -244,7 +244,8 @@ def flies_and_flies_again(table: dict[str, Any]) -> None:
     except InputError:  # what only building the controller shows, such as margins wider than their bounds
         return
     again = Rollout(reread).fly()
-    control, plant = flight.log.control, flight.log.plant
+    control = flight.log.control
+    plant = flight.log.plant
     assert parquet(flight.log, scenario) == parquet(again.log, reread)
     assert flight.log.reason == again.log.reason
     assert flight.log.reason is None or re.match(r"at t = \d+\.\d{3} s: \w", flight.log.reason)

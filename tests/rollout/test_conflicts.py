@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import ocp_peer
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
-from support import changing_period, fewer, random_problem, with_terms
+from support import changing_period, random_problem, with_terms
 
 from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
@@ -21,11 +21,17 @@ NEAR = 1e-4
 """Violation, as a share, that is too little for an independent solver to be sure of."""
 
 
+def fewer(share: float) -> settings:
+    """Settings for a property whose examples take long: a share of as many as the profile draws."""
+    return settings(max_examples=round(share * settings.default.max_examples))
+
+
 def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> InfeasiblePeriod:
     """A random problem from a state that is so far from the origin."""
     rng = np.random.default_rng(seed)
     problem = with_terms(rng, random_problem(rng, horizon=6, n=4, nu=2, n_c=2), terms)
-    state, desired = far * rng.normal(size=4), rng.normal(size=(6, 4))
+    state = far * rng.normal(size=4)
+    desired = rng.normal(size=(6, 4))
     before = problem.model.u_bar + rng.uniform(-3.0, 3.0, 2)
     now = changing_period(rng, problem)
     query = Query(state, desired, before, now.equilibrium, (now.A, now.B, now.c) if changing else None)
@@ -33,7 +39,8 @@ def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> I
 
 
 def period(infeasible_period: InfeasiblePeriod) -> ocp_peer.Period:
-    problem, query = infeasible_period.problem, infeasible_period.query
+    problem = infeasible_period.problem
+    query = infeasible_period.query
     now = ocp_peer.period(problem, query.state, query.desired, query.u_before, query.equilibrium)
     return now if query.steps is None else replace(now, **dict(zip("ABc", query.steps, strict=True)))
 
@@ -78,7 +85,8 @@ def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
 ) -> None:
     """Of bounds on states: without all others they stay as large, and shrink without any one that is blocking."""
     infeasible_period = posed(seed, terms, changing=changing, far=far)
-    problem, now = infeasible_period.problem, period(infeasible_period)
+    problem = infeasible_period.problem
+    now = period(infeasible_period)
     assume(ocp_peer.least_violation(problem, now) is not None)
     conflict = conflict_of(infeasible_period)
     assume(conflict.total > NEAR)
@@ -100,7 +108,8 @@ def test_the_smallest_widening_is_enough_and_no_less_is(
 ) -> None:
     """Each violated bound by itself, and all of them together."""
     infeasible_period = posed(seed, terms, changing=changing, far=far)
-    problem, query = infeasible_period.problem, infeasible_period.query
+    problem = infeasible_period.problem
+    query = infeasible_period.query
     conflict = conflict_of(infeasible_period)
     assume(conflict.total > NEAR)
     for sides in ({side} for side in conflict.violated):
@@ -114,7 +123,8 @@ def test_the_smallest_widening_is_enough_and_no_less_is(
 def widened(problem: Problem, sides: set[Side], amount: float) -> Problem:
     parts = []
     for place, part in enumerate(problem.every_constraint):
-        lower, upper = part.lower.copy(), part.upper.copy()
+        lower = part.lower.copy()
+        upper = part.upper.copy()
         for side in sides:
             if side.place == place and side.upper:
                 upper[..., side.row] += amount
@@ -175,10 +185,12 @@ def test_soft_constraints_are_never_in_conflict() -> None:
 
 
 def test_stored_periods_are_copies() -> None:
-    state, before = np.zeros(1), np.zeros(1)
+    state = np.zeros(1)
+    before = np.zeros(1)
     problem = integrator().problem
     stored = InfeasiblePeriod(
         problem=problem, query=Query(state, np.zeros((4, 1)), before), status="unsolved", time=0.0
     )
-    state[:], before[:] = 1.0, 1.0
+    state[:] = 1.0
+    before[:] = 1.0
     assert (stored.query.state, stored.query.u_before) == (0.0, 0.0)

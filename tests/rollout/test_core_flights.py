@@ -96,7 +96,8 @@ def differences(one: Flight, other: Flight) -> set[str]:
 @pytest.mark.parametrize("case", CASES)
 def test_it_has_the_bits_of_the_loop(case: str) -> None:
     scenario = scenario_of(CASES[case])
-    flight, usual = in_core(scenario), Rollout(scenario).fly()
+    flight = in_core(scenario)
+    usual = Rollout(scenario).fly()
     assert flight is not None
     assert differences(flight, usual) == UNCHECKED
     # By their numbers as printed, which are exact: some are NaN, which equals nothing.
@@ -153,7 +154,8 @@ def test_users_code_is_the_loops() -> None:
 def test_it_gives_up_what_does_not_go_as_usual(changes: dict[str, Any]) -> None:
     scenario = scenario_of(changes)
     assert in_core(scenario) is None
-    again, usual = fly_for_table(scenario), Rollout(scenario).fly()
+    again = fly_for_table(scenario)
+    usual = Rollout(scenario).fly()
     assert differences(again, usual) == set()
     assert (again.outcome, again.reason) == (usual.outcome, usual.reason)
 

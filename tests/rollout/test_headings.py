@@ -84,7 +84,8 @@ def test_a_law_called_by_itself_takes_headings_that_jump_by_whole_turns(name: st
     assembly = Assembly(scenario(name, 0.0))
 
     def commands(jumping: bool, lap: int = 0) -> Array:
-        law, acting = assembly.controller(), assembly.vehicle.hover_speed * np.ones(4)
+        law = assembly.controller()
+        acting = assembly.vehicle.hover_speed * np.ones(4)
         law.reset(assembly.initial_speeds)
         given = []
         for k in range(4):

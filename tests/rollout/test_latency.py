@@ -38,7 +38,8 @@ def flown(scenario: Scenario, **changes: Any) -> Flight:
 @pytest.mark.representative("latency")
 def test_a_law_that_knows_the_delay_survives_it(late: Scenario) -> None:
     """One that does not overturns; one told of a single period is worse than one told the truth."""
-    known, told = flown(late, **KNOWN), flown(late, **{"controller.delay": 0.025})
+    known = flown(late, **KNOWN)
+    told = flown(late, **{"controller.delay": 0.025})
     assert late.control_period == 0.025
     assert known.outcome == "satisfied"
     assert flown(late).outcome == "lost"
@@ -50,7 +51,8 @@ def test_a_law_that_knows_the_delay_survives_it(late: Scenario) -> None:
 
 def test_without_lag_rotors_turn_as_commanded_60_ms_before(late: Scenario) -> None:
     flight = flown(late, **KNOWN, **{"effects.rotors": None, "controller.rotor_lag": 0.0, "log_rate": 1000.0})
-    commands, turning = flight.log.control.speeds, flight.log.plant.speeds[:-1]
+    commands = flight.log.control.speeds
+    turning = flight.log.plant.speeds[:-1]
     shifted = np.repeat(commands, 25, axis=0)[: len(turning) - 60]
     np.testing.assert_array_equal(turning[60:], np.clip(shifted, 0.0, flight.vehicle.speed_max))
     np.testing.assert_array_equal(turning[:60], np.full((60, 4), flight.vehicle.hover_speed))

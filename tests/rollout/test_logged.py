@@ -22,7 +22,8 @@ class Logging:
     """Holds hover, logs the height [m] in each period and the thrust in some."""
 
     def __init__(self, vehicle: quadsim.Vehicle, period: float, horizon: int, **logged: Any) -> None:
-        self.speeds, self.logged = np.full(4, vehicle.hover_speed + 1.0), logged
+        self.speeds = np.full(4, vehicle.hover_speed + 1.0)
+        self.logged = logged
 
     def step(self, now: StepInputs, state: State, reference: Array) -> Array:
         now.log("height", -1.0)

@@ -148,7 +148,8 @@ except KeyboardInterrupt:
 @pytest.fixture
 def parent(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], set[int]]]:
     """A script, not guarded by `__main__`, in the middle of three flights, and all processes below it."""
-    script, diary = tmp_path / "parent.py", tmp_path / "diary"
+    script = tmp_path / "parent.py"
+    diary = tmp_path / "diary"
     script.write_text(PARENT)
     diary.touch()
     kinds = ["holds the interpreter", "hangs", "stops"]
@@ -218,7 +219,8 @@ def test_a_cluster_gives_the_same_rows_and_one_for_each_bad_flight(address: str)
 
 
 def test_a_dask_worker_that_is_killed_costs_nothing_but_time(address: str) -> None:
-    rows, killed = dict[int, Any](), 0
+    rows = dict[int, Any]()
+    killed = 0
     for at, row in fly_many(range(12), fly_slowly, cluster=address):
         rows[at] = row
         if len(rows) == 3:

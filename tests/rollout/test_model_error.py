@@ -24,11 +24,13 @@ ABOUT_Z = ("yaw", "yaw_rate")
 class Reversed:
     """A linear MPC whose model has the effect of attitude and rotors on some states with the wrong sign."""
 
-    name, solver = "mine", "piqp-multistage"
+    name = "mine"
+    solver = "piqp-multistage"
 
     def __init__(self, vehicle: quadsim.Vehicle, period: float, horizon: int, states: tuple[str, ...] = ()) -> None:
         model = mpc.hover_model(vehicle, period)
-        A, B = model.A.copy(), model.B.copy()
+        A = model.A.copy()
+        B = model.B.copy()
         rows = [INDEX[name] for name in states]
         for name in ("roll", "roll_rate"):
             A[rows, INDEX[name]] *= -1.0

@@ -51,7 +51,8 @@ def summary_of(run: Path) -> dict[str, Any]:
 
 
 def test_a_controller_that_raises_ends_its_flight_as_aborted(tmp_path: Path) -> None:
-    late, last = "raise ValueError('half way')", "ValueError: half way"
+    late = "raise ValueError('half way')"
+    last = "ValueError: half way"
     (tmp_path / "late.py").write_text(LAW.format(late=late))
     done = quadsim_command("run", "hover", *OWN, *BARE, here=tmp_path)
     assert done.returncode == 1, done.stderr
@@ -152,7 +153,8 @@ def test_ctrl_c_while_a_film_is_made_keeps_what_was_flown(tmp_path: Path) -> Non
     options = ("--set", "duration=20.0", "--no-recording", "--no-figures")
     command = [sys.executable, "-m", "quadsim.commands.entry", "run", "hover", *OWN, *options]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
-        summary, started = tmp_path / "runs" / "hover" / "summary.json", clock.monotonic()
+        summary = tmp_path / "runs" / "hover" / "summary.json"
+        started = clock.monotonic()
         while clock.monotonic() - started < 120.0 and not summary.exists():
             clock.sleep(0.1)
         clock.sleep(1.0)

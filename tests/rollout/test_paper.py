@@ -11,7 +11,8 @@ from quadsim.controller import ACCEPTED
 from quadsim.flight.audit import Finding
 from quadsim.rollout.flown import Flight, summarise
 
-SAMPLED, PLANT = 0.01, 0.05
+SAMPLED = 0.01
+PLANT = 0.05
 """How far beyond 5 deg roll and pitch may go [deg]: at the control samples, and at the physics rate."""
 
 
@@ -20,7 +21,8 @@ def findings(flight: Flight) -> dict[str, Finding]:
 
 
 def assert_constrained_flight_holds(flight: Flight, *, plant_tolerance: float) -> None:
-    control, result = flight.log.control, findings(flight)
+    control = flight.log.control
+    result = findings(flight)
     assert flight.log.status == "completed"
     assert len(control.status) == 1200
     assert set(control.status) <= ACCEPTED
@@ -59,7 +61,8 @@ def test_it_holds_over_the_parameters_the_paper_leaves_out(
 
 @pytest.mark.representative("paper")
 def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight: Flight) -> None:
-    control, result = unconstrained_flight.log.control, findings(unconstrained_flight)
+    control = unconstrained_flight.log.control
+    result = findings(unconstrained_flight)
     error = control.state[:, [0, 2, 4, 10]] - control.reference
     assert np.abs(error[-1]).max() < 0.01
     assert np.sqrt(np.mean(error[:, :3] ** 2, axis=0)).max() < 0.5

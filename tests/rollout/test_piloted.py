@@ -47,7 +47,8 @@ class Rates:
     commands = "rates"
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int) -> None:
-        self.mass, self.gravity = vehicle.mass, vehicle.gravity
+        self.mass = vehicle.mass
+        self.gravity = vehicle.gravity
 
     def force(self, state: State, reference: Array) -> Array:
         away = reference[0, :3] - [state.x, state.y, state.z]
@@ -72,7 +73,8 @@ class Attitude(Rates):
         return [self.mass * size, 0.0, 0.0, 0.0, *(tilted / np.linalg.norm(tilted))]
 
 
-THRUST, BODY_RATES = (3.5, 12.0), (150.0, 140.0, 60.0)
+THRUST = (3.5, 12.0)
+BODY_RATES = (150.0, 140.0, 60.0)
 TABLES: dict[str, dict[str, Any]] = {
     "nonlinear of rates": {"type": "nonlinear", "commands": "rates", "horizon": 20, "terminal": "lqr"},
     "geometric of rates": {"type": "geometric", "commands": "rates"},
@@ -107,7 +109,8 @@ def flight(scenario: quadsim.Scenario, law: str) -> quadsim.Flight:
 
 
 def test_it_comes_to_its_set_point_with_the_thrust_of_the_weight(law: str, flight: quadsim.Flight) -> None:
-    target, attitude = flight.log.control.target, flight.log.control.target_attitude
+    target = flight.log.control.target
+    attitude = flight.log.control.target_attitude
     assert flight.log.reason is None
     assert [abs(flight.state[axis][-1]) for axis in "xyz"] == pytest.approx([0.0] * 3, abs=0.03)
     assert target is not None
@@ -130,7 +133,8 @@ def test_its_targets_hold_the_bounds_that_it_has(law: str, flight: quadsim.Fligh
 
 
 def test_thrust_is_audited_as_commanded_and_as_flown(flight: quadsim.Flight) -> None:
-    control, plant = flight.log.control, flight.log.plant
+    control = flight.log.control
+    plant = flight.log.plant
     assert control.target is not None
     assert plant.thrust is not None
     mid = 0.5 * (plant.speeds[1:] + plant.speeds[:-1])  # flown thrust is that of the rotors between steps
@@ -393,7 +397,8 @@ def test_the_thrust_scale_that_is_logged_is_the_share_that_a_battery_leaves(
     controller = {**law, "commands": "rates", "disturbance": {}}
     changes = {"controller": controller, "effects.battery": battery, "duration": 1.5, "initial.position": [0.0] * 3}
     flight = quadsim.fly(scenario.replace(changes), progress=False)
-    log, settled = flight.log.plant, flight.time > 0.5
+    log = flight.log.plant
+    settled = flight.time > 0.5
     assert log.battery is not None
     share = np.square(log.battery[np.searchsorted(log.t, flight.time - 1e-9), 0] / 12.6)[settled]
     assert share[-1] < share[0] - 0.05

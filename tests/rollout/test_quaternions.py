@@ -31,10 +31,13 @@ ARRIVED = [f"constraints.{name}.start=0.9" for name in ("back_upright", "back_in
 class Listener:
     """Holds the rotors at one speed and keeps what it is given."""
 
-    name, solver, horizon = "listener", "", 1
+    name = "listener"
+    solver = ""
+    horizon = 1
 
     def reset(self, speeds: Array) -> None:
-        self.speeds, self.heard = speeds, list[tuple[StepInputs, Array]]()
+        self.speeds = speeds
+        self.heard = list[tuple[StepInputs, Array]]()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         self.heard.append((now, state))
@@ -73,7 +76,8 @@ def test_a_loop_by_sensors_is_flown_audited_and_logged(fly_once: Callable[..., F
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_yaw_after_a_loop_is_that_before(way: float) -> None:
     """Through the vertical Euler's yaw turns by 180 deg; noise decides which way."""
-    rng, angle = np.random.default_rng(3), way * np.linspace(0.0, 2.0 * np.pi, 200)
+    rng = np.random.default_rng(3)
+    angle = way * np.linspace(0.0, 2.0 * np.pi, 200)
     before = 2.0 * np.pi + 0.3
     half = 0.5 * angle
     heading = euler_to_quaternion(np.array([0.0, 0.0, before]))
@@ -111,7 +115,8 @@ def test_controllers_receive_the_attitude_that_belongs_to_their_state(name: str)
 
 def test_predicted_channels_are_not_passed_on_as_measured() -> None:
     now = StepInputs(attitude=np.array([1.0, 0.0, 0.0, 0.0]), body_rates=np.ones(3))
-    known, seen = np.zeros(N_STATES), np.zeros(N_STATES)
+    known = np.zeros(N_STATES)
+    seen = np.zeros(N_STATES)
     whole = completed_inputs(now, np.ones(4), seen, known)
     assert whole.attitude is now.attitude
     assert whole.body_rates is now.body_rates

@@ -129,7 +129,8 @@ def put(run: Path, name: str, column: str, change: Callable[[Any], Any]) -> None
     """Change a column of a table, and its hash, as one does who makes a mistake in writing it."""
     table = pq.read_table(run / name)
     values = change(table[column].to_numpy().copy())
-    i, field = table.column_names.index(column), table.schema.field(column)
+    i = table.column_names.index(column)
+    field = table.schema.field(column)
     pq.write_table(table.set_column(i, field, pa.array(values, field.type)), run / name)
     rehash(run, name)
 
@@ -175,7 +176,8 @@ def test_commands_are_followed_to_when_they_act(name: str, changes: dict[str, An
     flight = quadsim.fly(scenario, progress=False)
     flight.save(tmp_path / "run", video=False, recording=False, figures=False)
     assert reaudit(tmp_path / "run").summary["scenario"] == name
-    control, plant = flight.log.control, flight.log.plant
+    control = flight.log.control
+    plant = flight.log.plant
     speeds, known = _in_force(scenario, control, np.arange(plant.t.size - 1))
     np.testing.assert_array_equal(speeds[known], plant.speeds[:-1][known])
     assert 0.5 < known.mean() <= 1.0

@@ -122,7 +122,8 @@ def test_a_check_of_a_run_is_its_flight_with_the_new_audit(tmp_path: Path) -> No
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_comparison_reads_a_directory_once_and_no_flight_that_it_holds(tmp_path: Path) -> None:
-    one, two = run("hover", tmp_path / "one"), quadsim.fly("hover", progress=False)
+    one = run("hover", tmp_path / "one")
+    two = quadsim.fly("hover", progress=False)
     three = quadsim.load("hover", {**SHORT, "controller": {"type": "pid"}})
 
     def compare() -> None:
@@ -145,7 +146,8 @@ def test_a_run_of_an_earlier_version_that_states_who_compiles_is_read(tmp_path: 
     """It flew as it would now; to fly it anew, its file must do without."""
     event = {"type": "controller", "at": 0.2, "fields": {"horizon": 45}}
     run("robust", tmp_path / "run", SHORT | {"events": [event]})
-    tables, file = read_flight(tmp_path / "run").scenario.tables, tmp_path / "run" / "scenario.toml"
+    tables = read_flight(tmp_path / "run").scenario.tables
+    file = tmp_path / "run" / "scenario.toml"
     text = file.read_text()
     stated = text.replace("[controller]\n", "[controller]\ncompiled = true\n", 1)
     stated = stated.replace("\nhorizon = 45\n", "\nhorizon = 45\ncompiled = false\n", 1)

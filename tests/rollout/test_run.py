@@ -84,7 +84,8 @@ def test_the_summary_has_every_entry_of_the_contract(short_run: Flight) -> None:
 
 
 def test_the_summary_is_that_of_the_flight(short_run: Flight) -> None:
-    summary, log = short_run.summary, short_run.log
+    summary = short_run.summary
+    log = short_run.log
     assert (summary["scenario"], summary["status"], summary["reason"]) == ("paper-constrained", "completed", None)
     assert (summary["duration"], summary["seed"]) == (6.0, 0)
     assert summary["controller"]["statuses"] == dict(sorted(Counter(log.control.status).items()))

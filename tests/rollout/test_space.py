@@ -87,7 +87,8 @@ def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Fli
     assert crashed.outcome == "violated"
     assert outcome_line(crashed).plain.startswith("crashed, touched pillar, a required constraint is violated")
     assert not cleared(crashed)[0].satisfied
-    log, limit = crashed.log, cleared(crashed)[0].limit
+    log = crashed.log
+    limit = cleared(crashed)[0].limit
     clearance = limit.source.finest(log)[1]
     touch = log.plant.t[np.flatnonzero(clearance <= 0.0)[0]]
     first = log.control.t[log.control.phase.index(Phase.CRASHED)]
@@ -99,7 +100,8 @@ def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Fli
 def test_obstacles_out_of_reach_change_nothing() -> None:
     """Steps are then taken one by one where they move; the numbers are those of a flight without."""
     far = {**PILLAR, "position": [50.0, 0.0, 1.0]}
-    plain, among = Rollout(scenario()).fly(), Rollout(scenario({"obstacles": [far]})).fly()
+    plain = Rollout(scenario()).fly()
+    among = Rollout(scenario({"obstacles": [far]})).fly()
     np.testing.assert_allclose(among.log.plant.state, plain.log.plant.state, rtol=0.0, atol=1e-9)
     assert among.outcome == "satisfied"
 

@@ -39,7 +39,9 @@ def scenario_of(law: str) -> Scenario:
 
 def gain_over_horizon(problem: Problem) -> Array:
     """K (4, 12) of the first input of the unconstrained optimum, by the Riccati recursion."""
-    A, B, objective = problem.model.A, problem.model.B, problem.objective
+    A = problem.model.A
+    B = problem.model.B
+    objective = problem.objective
     Q = objective.C_r.T @ objective.Q_y @ objective.C_r
     P = Q.copy() if objective.P is None else objective.P
     for _ in range(problem.horizon):
@@ -81,11 +83,13 @@ def exponent(loop: Array, period: float) -> float:
 def turned(law: str, heading: float) -> float:
     """The exponent with a plant turned by a heading [deg], which the gain does not know."""
     A, B, K, period = loop_of(law)
-    c, s = math.cos(math.radians(heading)), math.sin(math.radians(heading))
+    c = math.cos(math.radians(heading))
+    s = math.sin(math.radians(heading))
     T = np.eye(len(A))
     for a, b in ((INDEX["x"], INDEX["y"]), (INDEX["vx"], INDEX["vy"])):
         T[a, a] = T[b, b] = c
-        T[a, b], T[b, a] = -s, s
+        T[a, b] = -s
+        T[b, a] = s
     return exponent(T @ A @ T.T - T @ B @ K, period)
 
 
@@ -135,7 +139,8 @@ def first_crossing(exponent_at: Callable[[float], float], low: float, high: floa
     if not any(signs):
         return None
     i = signs.index(True)
-    inner, outer = float(values[i - 1]), float(values[i])
+    inner = float(values[i - 1])
+    outer = float(values[i])
     while outer - inner > 1e-4 * (high - low):
         middle = 0.5 * (inner + outer)
         inner, outer = (inner, middle) if exponent_at(middle) > 0.0 else (middle, outer)
@@ -180,9 +185,11 @@ def test_the_loop_loses_its_stability_where_the_eigenvalues_say(law: str, quanti
     exponent_of, low, high = THEORY[quantity]
     margin = first_crossing(lambda value: exponent_of(law, value), low, high)
     assert margin is not None
-    below, above = (1.0 - WITHIN) * margin, (1.0 + WITHIN) * margin
+    below = (1.0 - WITHIN) * margin
+    above = (1.0 + WITHIN) * margin
     if quantity == "delay":  # of whole physics steps of 1 ms
-        below, above = math.floor(below), math.ceil(above)
+        below = math.floor(below)
+        above = math.ceil(above)
     assert flown(law, quantity, below).verdict == "stable"
     assert flown(law, quantity, above).verdict == "unstable"
 

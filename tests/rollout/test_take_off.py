@@ -95,7 +95,8 @@ def lead_of(flight: quadsim.Flight) -> np.ndarray[Any, np.dtype[np.float64]]:
 def test_a_law_that_learns_takes_over_from_the_lead(law: str) -> None:
     """The lead falls from lift-off on, the vehicle never sinks back, and no error is left."""
     flight = quadsim.fly(from_the_ground(law, 0.3, 0.3))
-    lead, z = lead_of(flight), flight.state["z"]
+    lead = lead_of(flight)
+    z = flight.state["z"]
     airborne = int(np.flatnonzero(z > AIRBORNE)[0])
     assert lead[airborne - 1] > 0.5
     assert (np.diff(lead[airborne:]) <= 0.0).all()
@@ -122,7 +123,8 @@ def test_rotors_that_saturate_stop_the_lead() -> None:
     load = {"effects.load": {"payloads": [{"mass": 4.0, "position": [0.0, 0.0, 0.0]}]}}
     dropped = {"events": [{"type": "payload_drop", "at": 12.0}]}
     flight = quadsim.fly(from_the_ground("robust", 0.3, 0.0, **load, **dropped))
-    lead, z = lead_of(flight), flight.state["z"]
+    lead = lead_of(flight)
+    z = flight.state["z"]
     assert z[flight.time < 12.0].max() < AIRBORNE
     assert lead.max() < LARGEST_LEAD
     assert z.max() < 6.0  # with 1.8 times its weight in thrust when the load goes

@@ -46,7 +46,8 @@ def paper_flight(entries: str) -> Flight:
 
 
 def test_a_bound_has_the_same_verdict_whether_the_controller_or_an_entry_states_it() -> None:
-    derived, stated = paper_flight("none"), paper_flight("stated")
+    derived = paper_flight("none")
+    stated = paper_flight("stated")
     assert (derived.command == stated.command).all()
     assert [finding.limit.tolerances for finding in derived.audit] == [f.limit.tolerances for f in stated.audit]
     assert derived.outcome == stated.outcome == "satisfied"
@@ -187,7 +188,8 @@ class Bounded:
         elif kind == "problem":
             self.problem = quadsim.problem("paper-constrained")
         elif kind == "junk":
-            self.bounds, self.constraints = {"roll": "wide"}, [7]
+            self.bounds = {"roll": "wide"}
+            self.constraints = [7]
 
     def step(self, *_: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
         return self.speeds
@@ -224,7 +226,9 @@ def test_an_entry_of_the_scenario_takes_precedence_over_the_controllers_bounds()
 
 def test_rows_that_combine_states_become_sums() -> None:
     C = np.zeros((2, 12))
-    C[0, 0], C[0, 1], C[1, 6] = 1.0, 0.5, -2.0
+    C[0, 0] = 1.0
+    C[0, 1] = 0.5
+    C[1, 6] = -2.0
     row = mpc.Constraint(name="near", lower=np.array([-np.inf, -0.2]), upper=np.array([3.0, 0.4]), C=C)
     near, roll = user_limits(type("Law", (), {"constraints": [row]})())
     assert (near.name, near.signal, near.terms, near.upper) == ("near_1", "sum", {"x": 1.0, "vx": 0.5}, 3.0)
@@ -239,7 +243,8 @@ def test_rows_that_combine_states_become_sums() -> None:
 
 
 def test_flights_that_are_audited_differently_are_compared_by_margins_until_audited_alike() -> None:
-    a, b = paper_flight("stated"), paper_flight("strict")
+    a = paper_flight("stated")
+    b = paper_flight("strict")
     assert (a.outcome, b.outcome) == ("satisfied", "violated")
     different = quadsim.compare(a, b)
     first = different.text().splitlines()[0]
@@ -261,7 +266,8 @@ def test_campaigns_that_are_audited_differently_get_no_test_of_violations(tmp_pa
         quadsim.campaign(paper(constraints=constraints), vary=[mass], flights=4, workers=1, out=out)
         return out
 
-    lenient, strict = flown("lenient", ENTRIES), flown("strict", [{**entry, "tolerance": 0.0} for entry in ENTRIES])
+    lenient = flown("lenient", ENTRIES)
+    strict = flown("strict", [{**entry, "tolerance": 0.0} for entry in ENTRIES])
     compared = quadsim.compare(lenient, strict)
     assert compared.verdict == "not comparable"
     assert {"failure", "violation"}.isdisjoint(event.event for event in compared.events)

@@ -86,7 +86,9 @@ class Acting:
 @cache
 def acting(*changes: str) -> Acting:
     scenario = load_scenario("hover", [*BASE, *changes])
-    speeds, state, target = np.full(4, 190.0), np.full(12, 0.02), np.full((scenario.controller.horizon, 4), 0.1)
+    speeds = np.full(4, 190.0)
+    state = np.full(12, 0.02)
+    target = np.full((scenario.controller.horizon, 4), 0.1)
     with Rollout(scenario) as rollout:
         law = rollout.loop.controller
         law.reset(speeds)
@@ -97,7 +99,8 @@ def acting(*changes: str) -> Acting:
 @pytest.mark.parametrize("name", ACTUAL)
 def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> None:
     lag = LAGGING if name == "rotor_inertia" else []
-    modelled, real = acting(*lag), acting(*lag, f"actual.{name}={ACTUAL[name]}")
+    modelled = acting(*lag)
+    real = acting(*lag, f"actual.{name}={ACTUAL[name]}")
     assert np.abs(real.flown - modelled.flown).max() > 1e-9
     assert real.vehicle == modelled.vehicle
     for of in (lambda p: p.model.A, lambda p: p.model.B, lambda p: p.model.u_bar, lambda p: p.bounds.u_max):
@@ -132,7 +135,8 @@ def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     scenario = load_scenario("hover", ["duration=0.5", "actual.mass=4.4", "actual.arm_length=0.35"])
     directory = tmp_path / "heavy"
     Rollout(scenario).fly().save(directory, **NO_PRODUCTS)
-    run, flight = read_flight(directory), quadsim.read(directory)
+    run = read_flight(directory)
+    flight = quadsim.read(directory)
     assert (run.summary["vehicle"]["mass"], run.summary["actual"]["mass"]) == (4.0, 4.4)
     assert (flight.vehicle.mass, flight.actual.mass, run.actual.arm_length) == (4.0, 4.4, 0.35)
     assert reaudit(directory).satisfied == flight.satisfied

@@ -179,7 +179,8 @@ def test_what_a_set_point_leaves_of_the_course_is_counted(vehicle: Vehicle) -> N
     """A circle of 2.5 deg that turns its yaw by 10 deg at 2 s, when it has hardly begun."""
     circle = {"type": "circle", "radius": 3.0, "speed": 1.136, "turns": 2.0, "ramp": 10.0}
     turn = {"type": "setpoint", "at": 2.0, "yaw": 10.0}
-    alone, turned = found(circle, vehicle, duration=44.0), found(circle, vehicle, duration=44.0, events=[turn])
+    alone = found(circle, vehicle, duration=44.0)
+    turned = found(circle, vehicle, duration=44.0, events=[turn])
     assert turned.tilt == pytest.approx(alone.tilt, rel=1e-3)
     assert turned.tilt == pytest.approx(math.degrees(math.atan(1.136**2 / 3.0 / vehicle.gravity)), rel=2e-2)
     assert (turned.jumps, turned.yaw) == ((2.0,), pytest.approx(10.0))
@@ -199,7 +200,8 @@ def test_a_course_is_followed_until_each_axis_that_moves_has_a_set_point(vehicle
 
 def test_a_filtered_set_point_requires_what_the_filter_leaves_of_it(vehicle: Vehicle) -> None:
     """At most d (3 / tau_r)^2, of a step of 1 m."""
-    still, step = {"response_time": 3.0}, [{"type": "setpoint", "at": 1.0, "y": 1.0}]
+    still = {"response_time": 3.0}
+    step = [{"type": "setpoint", "at": 1.0, "y": 1.0}]
     required = math.degrees(math.atan(1.0 / vehicle.gravity))
     assert found(still, vehicle, events=step).tilt == pytest.approx(required, rel=0.1)
     assert found({"response_time": 1.0}, vehicle, events=step).problems[0].startswith("34.3 deg of roll ")

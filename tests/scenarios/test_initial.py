@@ -54,7 +54,8 @@ def positions(flight: Flight) -> Array:
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
 def test_with_stopped_rotors_it_flies_a_parabola_and_spins_evenly(integrator: str) -> None:
     flight = quadsim.fly(thrown(**{"plant.integrator": integrator}), controller=holds(STOPPED), progress=False)
-    t, g = flight.log.plant.t[:, None], flight.vehicle.gravity
+    t = flight.log.plant.t[:, None]
+    g = flight.vehicle.gravity
     parabola = [0.5, -0.3, 40.0] + t * VELOCITY - 0.5 * g * t**2 * [0.0, 0.0, 1.0]
     np.testing.assert_allclose(positions(flight), parabola, atol=1e-9)
     start = Rotation.from_euler("ZYX", [130.0, -20.0, 35.0], degrees=True)
@@ -70,7 +71,8 @@ def test_without_torque_angular_momentum_and_energy_are_kept(integrator: str) ->
     log = quadsim.fly(scenario, controller=holds(STOPPED), progress=False).log
     attitude = Rotation.from_euler("ZYX", log.plant.state[:, [10, 8, 6]])
     J = np.array(quadsim.load_vehicle("lopes2011").inertia)
-    roll, pitch = log.plant.state[:, 6], log.plant.state[:, 8]
+    roll = log.plant.state[:, 6]
+    pitch = log.plant.state[:, 8]
     a, b, c = log.plant.state[:, [7, 9, 11]].T
     rates = np.column_stack(
         [
@@ -95,7 +97,8 @@ def test_with_hover_thrust_it_flies_straight_on() -> None:
 
 
 def test_lagging_rotors_start_at_their_speeds_and_the_law_after_that_command() -> None:
-    speeds, asked = [120.0, 150.0, 180.0, 210.0], []
+    speeds = [120.0, 150.0, 180.0, 210.0]
+    asked = []
 
     def law(now: StepInputs, state: Array, reference: Array) -> Array:
         asked.append(now.acting)
@@ -113,7 +116,8 @@ def test_lagging_rotors_start_at_their_speeds_and_the_law_after_that_command() -
 @pytest.mark.parametrize("name", ["constrained", "robust", "nonlinear", "lqr", "pid", "geometric"])
 def test_every_controller_starts_after_the_initial_command(name: str) -> None:
     """From 20 rad/s below hover, bounded steps lead up from there."""
-    speeds, law = [175.0, 170.0, 165.0, 170.0], {"type": name}
+    speeds = [175.0, 170.0, 165.0, 170.0]
+    law = {"type": name}
     if name == "nonlinear":
         law |= {"horizon": 20, "inputs": "speed"}
     scenario = load_scenario("robust" if name == "robust" else "hover", {"constraints": [], "duration": 0.3})

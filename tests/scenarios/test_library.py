@@ -58,7 +58,8 @@ def flown_here() -> list[str]:
 
 def flights() -> list[ParameterSet]:
     """`make test` flies the two that other modules need as well."""
-    slow, representative = pytest.mark.slow("library"), pytest.mark.representative("library")
+    slow = pytest.mark.slow("library")
+    representative = pytest.mark.representative("library")
     quick = ("paper-constrained", "paper-unconstrained")
     return [pytest.param(name, marks=[slow, representative] if name in quick else slow) for name in flown_here()]
 
@@ -204,7 +205,8 @@ def test_the_last_digits_change_neither_the_worst_constraint_nor_a_worst_time(fl
         other = worst_finding(shaken)
         assert (other and other.limit.name) == (worst and worst.limit.name)
     log = flight.log
-    control, plant = log.control, log.plant
+    control = log.control
+    plant = log.plant
     truth = control.truth + 1e-10 * rng.uniform(-1.0, 1.0, control.truth.shape)
     state = plant.state + 1e-10 * rng.uniform(-1.0, 1.0, plant.state.shape)
     again = replace(log, control=replace(control, truth=truth), plant=replace(plant, state=state))
@@ -214,7 +216,8 @@ def test_the_last_digits_change_neither_the_worst_constraint_nor_a_worst_time(fl
 
 
 def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
-    control, plant = flight.log.control, flight.log.plant
+    control = flight.log.control
+    plant = flight.log.plant
     measured = control.state.copy()
     if flight.scenario.name == "nan-position":  # what the sensor measured then; nothing else
         measured[np.ix_((control.t > 2.99) & (control.t < 3.51), [0, 2, 4])] = 0.0
@@ -231,12 +234,14 @@ def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
 
 
 def test_it_is_reproducible_to_the_bit(flight: Flight) -> None:
-    periods, steps = periods_compared(flight.scenario), flight.scenario.steps_per_period
+    periods = periods_compared(flight.scenario)
+    steps = flight.scenario.steps_per_period
     assert numbers(flown_again(flight.scenario, periods), periods, steps) == numbers(flight.log, periods, steps)
 
 
 def test_its_numbers_are_the_golden_ones(flight: Flight) -> None:
-    golden, result = read("library")[flight.scenario.name], library_entry(flight)
+    golden = read("library")[flight.scenario.name]
+    result = library_entry(flight)
     assert result.keys() == golden.keys()
     assert [result[key] for key in SAME if key in result] == [golden[key] for key in SAME if key in golden]
     for key, tolerance in TOLERANCES.items():

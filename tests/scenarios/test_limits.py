@@ -158,7 +158,8 @@ def test_a_required_constraint_that_the_flight_does_not_reach_makes_it_incomplet
 
 
 def test_the_command_line_tells_incomplete_from_violated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, verdicts = tmp_path / "scenario.toml", tmp_path / "verdicts.xml"
+    path = tmp_path / "scenario.toml"
+    verdicts = tmp_path / "verdicts.xml"
     path.write_text(incomplete().to_toml())
     quiet = ["--out", str(tmp_path / "run"), "--no-video", "--no-recording", "--no-figures"]
     assert main(["run", str(path), *quiet]) == EXIT_DONE
@@ -197,7 +198,7 @@ def test_what_the_rotors_can_do_is_the_bound_of_audit_notes_and_feasibility() ->
     assert assembly.bounds["speed"] == (0.0, 200.0)
     assert [(limit.lower, limit.upper) for limit in assembly.limits if limit.signal == "speed"] == [(0.0, 200.0)]
     (note,) = hover_notes(assembly)
-    assert note == "hover needs 202.2 rad/s, the bound is 200: no controller can hold altitude"
+    assert note.startswith("hover needs 202.2 rad/s, the bound is 200")
 
 
 def test_a_difference_is_noted_from_when_it_is_there() -> None:

@@ -22,7 +22,8 @@ POLYTOPES: list[dict[str, Any]] = [{"name": "fence", **FENCE}, {"name": "turning
 )
 def test_the_file_has_each_bound_where_its_row_says(name: str, changes: dict[str, Any]) -> None:
     scenario = quadsim.load(name).replace({**changes, "controller.polytopes": POLYTOPES})
-    file, seen = tomllib.loads(scenario.to_toml()), set()
+    file = tomllib.loads(scenario.to_toml())
+    seen = set()
     for constraint in quadsim.problem(scenario).every_constraint:
         for row in range(constraint.lower.shape[-1]):
             origin = constraint.origin(row)

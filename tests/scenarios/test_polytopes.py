@@ -40,15 +40,18 @@ def test_rows_are_in_the_units_of_the_file() -> None:
     (constraint,) = problem_of(table()).constraints
     assert constraint.C is not None
     assert constraint.D is not None
-    state, speeds = np.zeros(12), np.array([1.0, 20.0, 3.0, 4.0])
-    state[INDEX["pitch"]], state[INDEX["x"]] = math.radians(0.5), 3.0
+    state = np.zeros(12)
+    speeds = np.array([1.0, 20.0, 3.0, 4.0])
+    state[INDEX["pitch"]] = math.radians(0.5)
+    state[INDEX["x"]] = 3.0
     np.testing.assert_allclose(constraint.C @ state + constraint.D @ speeds, [0.5 + 6.0, 20.0])
     np.testing.assert_array_equal(constraint.upper, [4.0, 240.0])
     assert constraint.penalty is None
 
 
 def test_the_audit_sees_the_same_rows_at_the_physics_rate() -> None:
-    scenario, log = parse_scenario(table()), small_log()
+    scenario = parse_scenario(table())
+    log = small_log()
     limits = [limit for limit in Assembly(scenario).limits if limit.signal == SUM]
     assert [limit.name for limit in limits] == ["mixed_1", "mixed_2"]
     assert [limit.unit for limit in limits] == ["-", "rad/s"]

@@ -14,7 +14,8 @@ from quadsim.state import REFERENCE_NAMES, Array
 
 
 def solved(qp: CondensedQP) -> Array:
-    upper, lower = np.concatenate([qp.x_max, qp.upper]), np.concatenate([qp.x_min, qp.lower])
+    upper = np.concatenate([qp.x_max, qp.upper])
+    lower = np.concatenate([qp.x_min, qp.lower])
     x, _, flag, _ = daqp.solve(qp.H, qp.f, qp.A, upper, lower)
     assert flag == 1
     return np.asarray(x)
@@ -22,7 +23,8 @@ def solved(qp: CondensedQP) -> Array:
 
 def test_another_solver_gives_the_paper_s_commands() -> None:
     scenario = quadsim.load("paper-constrained").replace({"duration": 12.0})
-    flight, problem = quadsim.fly(scenario), quadsim.problem(scenario)
+    flight = quadsim.fly(scenario)
+    problem = quadsim.problem(scenario)
     control = flight.log.control
     reference = np.stack([flight.reference[name] for name in REFERENCE_NAMES], axis=1)
     active = np.flatnonzero(control.active[1 : -problem.horizon - 1]) + 1
@@ -41,8 +43,10 @@ def test_another_solver_gives_the_paper_s_commands() -> None:
 @pytest.mark.parametrize("name", ["robust", "robust-lag50"])
 def test_the_problem_of_the_robust_controller_has_its_slacks_and_tightened_bounds(name: str, roll: float) -> None:
     scenario = quadsim.load(name, {"controller.fallback.enabled": False})
-    problem, law = quadsim.problem(scenario), quadsim.make_controller(scenario)
-    state, preview = np.zeros(12), np.tile([5.0, 1.0, 0.5, 0.0], (problem.horizon, 1))
+    problem = quadsim.problem(scenario)
+    law = quadsim.make_controller(scenario)
+    state = np.zeros(12)
+    preview = np.tile([5.0, 1.0, 0.5, 0.0], (problem.horizon, 1))
     state[6] = roll
     before = problem.model.u_bar.copy()
     law.reset(before)
@@ -61,8 +65,10 @@ def test_the_problem_of_the_robust_controller_has_its_slacks_and_tightened_bound
 
 
 def test_without_constraints_the_optimum_is_a_linear_system_and_the_law_s_command() -> None:
-    problem, law = quadsim.problem("paper-unconstrained"), quadsim.make_controller("paper-unconstrained")
-    state, preview = np.linspace(-0.1, 0.1, 12), np.tile([1.0, 2.0, 3.0, 0.1], (problem.horizon, 1))
+    problem = quadsim.problem("paper-unconstrained")
+    law = quadsim.make_controller("paper-unconstrained")
+    state = np.linspace(-0.1, 0.1, 12)
+    preview = np.tile([1.0, 2.0, 3.0, 0.1], (problem.horizon, 1))
     qp = problem.qp(state, preview, problem.model.u_bar)
     assert qp.A.shape == (0, 4 * problem.horizon)
     assert np.isinf([qp.x_min, qp.x_max]).all()

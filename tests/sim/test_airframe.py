@@ -106,7 +106,8 @@ def test_what_is_seen_weighs_nothing_and_meets_nothing():
 
 
 def test_the_physics_model_has_nothing_to_look_at_and_flies_the_same():
-    bare, drawn = compile_model(LOPES), compile_model(LOPES, visuals=True)
+    bare = compile_model(LOPES)
+    drawn = compile_model(LOPES, visuals=True)
     assert (bare.ngeom, bare.nbody, bare.ntex, bare.ncam, bare.nlight, bare.nsensor) == (0, 2, 0, 0, 0, 0)
     states = []
     for model in (bare, drawn):

@@ -55,13 +55,16 @@ def hover(vehicle: Vehicle, *rates: float) -> Array:
 
 @pytest.mark.parametrize("airmode", [True, False])
 def test_the_mixer_gives_what_fits_and_says_what_it_cut(vehicle: Vehicle, airmode: bool) -> None:
-    autopilot, rng = Autopilot(vehicle, AutopilotSettings(airmode=airmode)), np.random.default_rng(1)
+    autopilot = Autopilot(vehicle, AutopilotSettings(airmode=airmode))
+    rng = np.random.default_rng(1)
     lowest, top = vehicle.thrusts(np.array([[vehicle.speed_min], [vehicle.speed_max]]))
     lift = 4.0 * vehicle.thrust_shares
-    least, most = 4.0 * float((lowest / lift).max()), vehicle.level_thrust(vehicle.speed_max)
+    least = 4.0 * float((lowest / lift).max())
+    most = vehicle.level_thrust(vehicle.speed_max)
     reach = np.abs(vehicle.allocation[1:] / vehicle.coefficients) @ top
     for _ in range(300):
-        thrust, torque = most * rng.uniform(-0.1, 1.1), reach * rng.normal(size=3) * rng.choice([0.05, 0.3, 1.0])
+        thrust = most * rng.uniform(-0.1, 1.1)
+        torque = reach * rng.normal(size=3) * rng.choice([0.05, 0.3, 1.0])
         thrusts, cut = mix(vehicle, autopilot.settings, float(thrust), torque)
         assert np.all(thrusts >= lowest * (1.0 - 1e-12))
         assert np.all(thrusts <= top * (1.0 + 1e-12))
@@ -131,7 +134,8 @@ def test_a_constant_torque_is_integrated_away(vehicle: Vehicle) -> None:
 
 def test_the_integral_is_limited_and_stops_where_an_axis_is_cut(vehicle: Vehicle) -> None:
     autopilot = Autopilot(vehicle, AutopilotSettings(i_max=(0.5, 0.5, 0.1)))
-    still, level = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    still = np.zeros(3)
+    level = np.array([1.0, 0.0, 0.0, 0.0])
     for _ in range(2000):
         autopilot.speeds(0.0, hover(vehicle, 0.2, 0.0, 0.0), still, still, level)
     assert list(autopilot._struct.integral) == pytest.approx([0.5, 0.0, 0.0])
@@ -154,7 +158,8 @@ def test_it_answers_as_its_equations_do(vehicle: Vehicle, airmode: bool, size: i
     """Through targets and motions of all sizes, saturated and not."""
     rng = np.random.default_rng(7)
     settings = AutopilotSettings(airmode=airmode, delay=2e-3, idle=0.05, d=(1.0, 0.5, 0.2))
-    autopilot, expected = Autopilot(vehicle, settings), NumpyAutopilot(vehicle, settings)
+    autopilot = Autopilot(vehicle, settings)
+    expected = NumpyAutopilot(vehicle, settings)
     weight = vehicle.mass * vehicle.gravity
     for k in range(120):
         wild = (0.1, 1.0, 10.0)[k % 3]
@@ -166,10 +171,13 @@ def test_it_answers_as_its_equations_do(vehicle: Vehicle, airmode: bool, size: i
 
 
 def test_a_copy_flies_on_by_itself(vehicle: Vehicle) -> None:
-    autopilot, still = Autopilot(vehicle), np.array([1.0, 0.0, 0.0, 0.0])
+    autopilot = Autopilot(vehicle)
+    still = np.array([1.0, 0.0, 0.0, 0.0])
     autopilot.speeds(0.0, hover(vehicle, 1.0, 0.0, 0.0), np.zeros(3), still, still)
     for copied in (copy.deepcopy(autopilot), pickle.loads(pickle.dumps(autopilot))):
-        twin, one, other = copy.deepcopy(autopilot), [], []
+        twin = copy.deepcopy(autopilot)
+        one = []
+        other = []
         for k in range(5):
             given = (1e-3 * k, hover(vehicle, 0.3, 0.1 * k, 0.0), 0.2 * np.ones(3), still, still)
             one.append(twin.speeds(*given))
@@ -192,7 +200,8 @@ def test_the_lag_of_thrust_is_that_of_the_rotors(vehicle: Vehicle) -> None:
 
 
 def test_gyro_noise_moves_the_rotors_less_behind_the_filter(vehicle: Vehicle) -> None:
-    rng, still = np.random.default_rng(0), np.array([1.0, 0.0, 0.0, 0.0])
+    rng = np.random.default_rng(0)
+    still = np.array([1.0, 0.0, 0.0, 0.0])
     spread = []
     noise = 0.1 * rng.normal(size=(500, 3))
     for cutoff in (0.0, 100.0):
@@ -213,7 +222,8 @@ def test_a_loop_too_slow_for_a_lag_is_refused(vehicle: Vehicle) -> None:
 
 
 def test_a_delay_is_a_whole_number_of_periods(vehicle: Vehicle) -> None:
-    rates, still = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    rates = np.array([1.0, 0.0, 0.0])
+    still = np.array([1.0, 0.0, 0.0, 0.0])
     autopilot = Autopilot(vehicle, AutopilotSettings(delay=3e-3))
     answers = [autopilot.speeds(0.0, hover(vehicle), rates, still, still) for _ in range(5)]
     assert [bool(np.ptp(answer - vehicle.hover_speeds) > 1.0) for answer in answers] == [

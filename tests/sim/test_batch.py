@@ -195,7 +195,8 @@ def test_margins_of_a_batch_are_those_of_its_flights() -> None:
     for period in range(4):
         batch.reference[:] = 0.1 * period
         batch.measured[:] = batch.state + 0.01
-        before, acting = batch.state.copy(), batch.acting.copy()
+        before = batch.state.copy()
+        acting = batch.acting.copy()
         batch.fly(np.stack([command_of(place, period) for place in range(3)]))
         heights = np.stack([batch.flown(place)["physics"][:, 3] for place in range(3)])
         expected = np.minimum(heights + 0.5, 2.0 - heights)

@@ -17,7 +17,9 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
-PERIODS, STEPS, HORIZON = 10, 50, 4
+PERIODS = 10
+STEPS = 50
+HORIZON = 4
 
 
 @dataclass

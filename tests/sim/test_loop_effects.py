@@ -26,7 +26,8 @@ from quadsim.sim.sensing import FaultKind, Sensor, SensorFault, SensorName
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
-PERIOD, STEPS = 0.05, 50
+PERIOD = 0.05
+STEPS = 50
 
 
 @dataclass
@@ -41,7 +42,8 @@ class Scripted:
     states: list[Array] = field(default_factory=list)
 
     def reset(self, speeds: Array) -> None:
-        self.moments, self.states = [], []
+        self.moments = []
+        self.states = []
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         k = len(self.moments)
@@ -283,7 +285,8 @@ def test_the_controller_alone_sees_a_reference_raised_for_take_off(vehicle: Vehi
 
     script = 0.7 * vehicle.hover_speed * np.ones((30, 4))
     script[12:] *= 1.01 ** np.arange(18)[:, None]
-    reference, motion = np.zeros((32, 4)), np.zeros((32, 3))
+    reference = np.zeros((32, 4))
+    motion = np.zeros((32, 3))
     reference[:, 2] = motion[:, 2] = 0.5
     controller = Seeing(script)
     rest = {"velocity": motion * 0.0, "acceleration": motion * 0.0, "body_rates": motion * 0.0}

@@ -67,7 +67,8 @@ def test_without_sensors_the_truth_is_passed_on(vehicle: Vehicle, physics: Array
 
 @pytest.mark.parametrize("estimator", [None, EstimatorSettings()], ids=["held", "estimated"])
 def test_yaw_is_counted_over_whole_turns(estimator: EstimatorSettings | None, vehicle: Vehicle) -> None:
-    hover, spin = np.full(4, vehicle.hover_speed), 6.0 * math.pi
+    hover = np.full(4, vehicle.hover_speed)
+    spin = 6.0 * math.pi
     with Plant(vehicle) as plant:
         start = make_state()
         start[INDEX["yaw_rate"]] = spin
@@ -149,7 +150,8 @@ def test_the_estimate_is_near_the_truth_and_its_yaw_unwrapped(vehicle: Vehicle, 
 def test_the_estimator_alone_minds_that_the_feet_stand(on_ground: bool, vehicle: Vehicle, physics: Array) -> None:
     cold = np.zeros((200, 4))
     ground = np.tile(physics[:1], (201, 1))
-    ground[:, 4:8], ground[:, 8:] = [1.0, 0.0, 0.0, 0.0], 0.0
+    ground[:, 4:8] = [1.0, 0.0, 0.0, 0.0]
+    ground[:, 8:] = 0.0
     for estimator in (None, EstimatorSettings()):
         navigation = build(vehicle, SENSORS, estimator=estimator)
         navigation.reset(ground[0], cold[0])

@@ -27,7 +27,8 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
-PERIOD, STEPS = 0.05, 50
+PERIOD = 0.05
+STEPS = 50
 
 
 def newton_euler(vehicle: Vehicle, start: Array, holds: Array) -> Array:
@@ -55,7 +56,8 @@ def newton_euler(vehicle: Vehicle, start: Array, holds: Array) -> Array:
 
 @pytest.mark.parametrize(("seed", "layout"), [(0, "even"), (1, "even"), (2, "uneven")])
 def test_four_seconds_of_random_commands_match_newton_euler(vehicle: Vehicle, seed: int, layout: str) -> None:
-    rng, vehicle = np.random.default_rng(seed), uneven() if layout == "uneven" else vehicle
+    rng = np.random.default_rng(seed)
+    vehicle = uneven() if layout == "uneven" else vehicle
     holds = vehicle.hover_speeds + rng.uniform(-8.0, 8.0, (80, 4))
     with Plant(vehicle) as plant:
         plant.reset(make_state(euler=(0.1, -0.2, 0.5)))
@@ -228,7 +230,8 @@ def test_a_fatal_error_of_mujoco_ends_the_flight_and_not_the_process(vehicle: Ve
     """In its bindings it stays the exception that it is."""
     with Plant(vehicle) as plant:
         plant.advance(plant.vehicle.hover_speeds, 5)
-        before, integrator = plant.physics, plant.model.opt.integrator
+        before = plant.physics
+        integrator = plant.model.opt.integrator
         plant.model.opt.integrator = 99
         with pytest.raises(DivergenceError, match=r"0\.005 s: .*diverged"):
             plant.advance(plant.vehicle.hover_speeds, 5)

@@ -22,7 +22,8 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle, load_vehicle
 
-LINEAR, QUADRATIC = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
+LINEAR = (0.3, 0.2, 0.05)
+QUADRATIC = (0.08, 0.1, 0.12)
 DRAG = Effects(air=Air(linear_drag=LINEAR, quadratic_drag=QUADRATIC))
 START = np.array([0.0, 4.0, 0.0, -3.0, 20.0, 1.0, 0.4, 0.5, -0.7, -0.3, 1.0, 0.8])
 SMOOTH = START + 8.0 * np.eye(12)[5]
@@ -52,7 +53,8 @@ def rates(x: Array, vehicle: Vehicle, wind: Array) -> Array:
             [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
         ]
     )
-    v, omega = x[7:10], x[10:13]
+    v = x[7:10]
+    omega = x[10:13]
     along = R.T @ (v - wind)
     drag = -np.array(LINEAR) * along - np.array(QUADRATIC) * along * np.abs(along)
     push, *torque = vehicle.allocation @ SPEEDS**2
@@ -175,7 +177,8 @@ def test_drag_along_the_axes_alone_slows_a_fall_as_its_closed_form(torrente: Veh
 
 def test_thrust_noise_has_the_mean_and_the_deviation_that_are_stated(torrente: Vehicle) -> None:
     """Of the collective thrust: its share has a quarter of the variance of one rotor's, as these are independent."""
-    noisy, count = Effects(thrust_noise=ThrustNoise(loss=0.06, deviation=0.02)), 20_000
+    noisy = Effects(thrust_noise=ThrustNoise(loss=0.06, deviation=0.02))
+    count = 20_000
     full = 4.0 * torrente.thrust_coefficient * torrente.speed_max**2
     with Plant(torrente, effects=noisy, timestep=1e-4, integrator="rk4") as plant:
         for share in (0.1, 0.5, 0.9):

@@ -27,7 +27,9 @@ def physics() -> Array:
     """(STEPS + 1, 14) states of a vehicle that moves, and is tilted far."""
     t = TIMESTEP * np.arange(STEPS + 1)
     rows = np.empty((STEPS + 1, 14))
-    rows[:, 0], rows[:, 1:4], rows[:, 8:11] = t, np.stack([t, t**2, np.sin(t)], 1), np.stack([t, 2 * t, -t], 1)
+    rows[:, 0] = t
+    rows[:, 1:4] = np.stack([t, t**2, np.sin(t)], 1)
+    rows[:, 8:11] = np.stack([t, 2 * t, -t], 1)
     rows[:, 4:8] = euler_to_quaternion(np.stack([1.2 * np.sin(t), 1.4 * np.cos(t), 0.5 * t], 1))
     rows[:, 11:14] = np.stack([np.cos(t), np.sin(2 * t), 0.1 * t], 1)
     return rows
@@ -39,7 +41,8 @@ def sampled(name: SensorName, sensor: Sensor, *faults: SensorFault, of: Array, s
 
 def errors(samples: NDArray[np.void], physics: Array) -> Array:
     """(n, 3) what samples say beyond the truth; rotation vectors for attitude."""
-    at, values = samples["taken"], samples["value"]
+    at = samples["taken"]
+    values = samples["value"]
     name = list(SensorName)[samples["kind"][0]]
     if name is not SensorName.ATTITUDE:
         return np.asarray(values - truth(name, physics[at]))
@@ -56,7 +59,8 @@ def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) ->
 
 @pytest.mark.parametrize("name", list(SensorName))
 def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Array) -> None:
-    noise, bias = np.array([0.01, 0.02, 0.05]), np.array([0.1, -0.2, 0.05])
+    noise = np.array([0.01, 0.02, 0.05])
+    bias = np.array([0.1, -0.2, 0.05])
     stated = [np.degrees(v) if name in ("attitude", "rates") else v for v in (noise, bias)]
     sensor = Sensor(rate=1000.0, noise=tuple(stated[0]), bias=tuple(stated[1]))
     result = errors(sampled(name, sensor, of=physics), physics)
@@ -89,7 +93,8 @@ def test_the_share_lost_is_as_stated(physics: Array) -> None:
 
 
 def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> None:
-    sensor, name = Sensor(rate=1000.0, noise=0.1, outliers=Outliers(probability=0.1, size=20.0)), SensorName.POSITION
+    sensor = Sensor(rate=1000.0, noise=0.1, outliers=Outliers(probability=0.1, size=20.0))
+    name = SensorName.POSITION
     result = errors(sampled(name, sensor, of=physics), physics)
     clean = errors(sampled(name, replace(sensor, outliers=None), of=physics), physics)
     widened = np.isclose(result, 20.0 * clean, rtol=1e-6, atol=1e-9)
@@ -122,11 +127,13 @@ def test_the_core_hears_each_sample_when_it_arrives_however_time_is_cut(
     expected = taken(sampler_of(name, sensor, *faults, rng=generators[1 + KINDS[name]]), physics[:401])
     for _ in range(2):  # and the same again after a reset
         navigation.reset(physics[0], np.zeros(4))
-        first, at = 0, 0
+        first = 0
+        at = 0
         while first < 400:
             count = min(cuts[at % len(cuts)], 400 - first)
             follow(navigation, physics[first + 1 : first + 1 + count], np.zeros((count, 4)), first)
-            first, at = first + count, at + 1
+            first = first + count
+            at = at + 1
             heard = expected[expected["taken"] + 20 <= first]
             state = navigation.state()[[0, 2, 4] if name is SensorName.POSITION else [6, 8, 10]]
             if len(heard):
@@ -142,7 +149,8 @@ def test_the_core_hears_each_sample_when_it_arrives_however_time_is_cut(
     [{"noise": 1.0}, {"bias_walk": (1.0, 1.0, 1.0)}, {"outliers": Outliers(probability=0.5, size=3.0)}],
 )
 def test_one_imperfection_leaves_the_draws_of_the_others_alone(change: dict[str, Any], physics: Array) -> None:
-    sensor, name = Sensor(rate=100.0, dropout=0.5), SensorName.POSITION
+    sensor = Sensor(rate=100.0, dropout=0.5)
+    name = SensorName.POSITION
     plain = sampled(name, sensor, of=physics)
     assert np.array_equal(sampled(name, replace(sensor, **change), of=physics)["taken"], plain["taken"])
 

@@ -88,7 +88,8 @@ def test_one_value_goes_to_all_of_its_fields_and_relative_ones_multiply(tmp_path
         name="size",
     )
     made = plan(tmp_path, vary=vary, scenario="paper-constrained")
-    base, flown = made.scenario, made.of(1)
+    base = made.scenario
+    flown = made.of(1)
     factor = made.identity(1)["draw.size"]
     assert base.vehicle.arm_length is not None
     assert base.vehicle.inertia is not None
@@ -130,7 +131,8 @@ def test_every_campaign_that_ships_can_be_flown(name: str) -> None:
 
 
 def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
-    paper, robust = load_plan("paper-robustness"), load_plan("paper-robustness-robust")
+    paper = load_plan("paper-robustness")
+    robust = load_plan("paper-robustness-robust")
     assert [paper.identity(k) for k in range(20)] == [robust.identity(k) for k in range(20)]
     other = {name: getattr(paper.of(3), name) for name in ("controller", "name", "description")}
     assert robust.of(3).altered(**other) == paper.of(3)
@@ -138,14 +140,16 @@ def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
 
 
 def test_the_campaigns_on_a_battery_differ_in_what_the_observer_estimates() -> None:
-    force, scale = load_plan("battery"), load_plan("battery-thrust-scale")
+    force = load_plan("battery")
+    scale = load_plan("battery-thrust-scale")
     assert [force.identity(k) for k in range(20)] == [scale.identity(k) for k in range(20)]
     assert [field for field, *_ in plan_differences(force, scale)] == ["controller.disturbance.thrust_scale"]
 
 
 def test_the_nominal_campaign_is_of_small_errors_at_the_papers_own_tolerance() -> None:
     """Its controller, its bounds and its tolerance at them; lag to 8 ms, mass within 5 %, perfect sensors."""
-    nominal, paper = load_plan("paper-nominal"), load_scenario("paper-constrained")
+    nominal = load_plan("paper-nominal")
+    paper = load_scenario("paper-constrained")
     assert nominal.scenario.controller == paper.replace({"controller.solver": "core"}).controller
     assert nominal.scenario.sensors == paper.sensors
     tilts = {limit.name: limit for limit in paper.constraints if limit.name in ("roll", "pitch", "speed", "slew")}

@@ -44,7 +44,8 @@ def test_a_better_controller_is_found_to_be(thousand: pa.Table, better: pa.Table
 
 def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> None:
     """Four of forty lost against none read as not distinguishable, without a word of it."""
-    one, other = make_campaign(40, seed=1, severity=100.0), make_campaign(40, seed=1, severity=100.0)
+    one = make_campaign(40, seed=1, severity=100.0)
+    other = make_campaign(40, seed=1, severity=100.0)
     verdicts = ["lost"] * 4 + ["violated"] * 36
     result = compare_pairs(changed(one, "verdict", verdicts), changed(other, "verdict", ["violated"] * 40), NAMES)
     assert result.verdict == "not distinguishable"

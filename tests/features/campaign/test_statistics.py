@@ -1,4 +1,4 @@
-"""Intervals and tests against closed forms, published numbers, other routes through scipy, and simulation."""
+"""Intervals and tests of a campaign against closed forms, published numbers, scipy, and simulation."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from quadsim.flight.audit import Limit
 
 
 @pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 20), (3, 20), (37, 1000), (999, 1000), (10, 10)])
-def test_the_interval_is_scipys(count: int, trials: int) -> None:
+def test_the_interval_is_that_of_scipy(count: int, trials: int) -> None:
     result = proportion(count, trials)
     exact = stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
     assert (result["lower"], result["upper"]) == pytest.approx((exact.low, exact.high), abs=1e-9)
@@ -49,9 +49,11 @@ def test_the_interval_is_scipys(count: int, trials: int) -> None:
 def test_bounds_in_closed_form() -> None:
     assert upper_bounds(0, 299, 0.95) == pytest.approx(1.0 - 0.05 ** (1.0 / 299.0), rel=1e-12)
     assert lower_bounds(50, 50, 0.99) == pytest.approx(0.01 ** (1.0 / 50.0), rel=1e-12)
-    assert (upper_bounds(50, 50), lower_bounds(0, 50)) == (1.0, 0.0)
+    assert upper_bounds(50, 50) == 1.0
+    assert lower_bounds(0, 50) == 0.0
     nothing = proportion(0, 0)
-    assert (nothing["share"], nothing["lower"], nothing["upper"], nothing["upper_one_sided"]) == (None, 0.0, 1.0, 1.0)
+    assert nothing["share"] is None
+    assert (nothing["lower"], nothing["upper"], nothing["upper_one_sided"]) == (0.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize("p", [0.002, 0.03, 0.2, 0.5, 0.97])
@@ -68,20 +70,21 @@ def test_bounds_have_their_nominal_coverage(n: int, p: float) -> None:
 
 def test_intervals_cover_simulated_campaigns() -> None:
     rng = np.random.default_rng(1)
-    result = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
-    covered = np.mean([one["lower"] <= 0.04 <= one["upper"] for one in result])
-    assert 0.95 <= covered < 0.985
+    intervals = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
+    covered = [interval["lower"] <= 0.04 <= interval["upper"] for interval in intervals]
+    assert 0.95 <= np.mean(covered) < 0.985
 
 
-def test_holm_is_holms() -> None:
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])  # p.adjust of R
+def test_holm_gives_the_numbers_of_r() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])  # p.adjust
     assert holm([0.5, 0.6]) == [1.0, 1.0]
     assert holm([]) == []
 
 
 def test_holm_keeps_the_chance_of_a_false_find() -> None:
     p = np.random.default_rng(3).uniform(size=(4000, 9))
-    assert np.mean([min(holm(list(row))) < 0.05 for row in p]) == pytest.approx(0.05, abs=0.012)
+    false_finds = [min(holm(list(row))) < 0.05 for row in p]
+    assert np.mean(false_finds) == pytest.approx(0.05, abs=0.012)
 
 
 def test_mcnemar_in_closed_form() -> None:
@@ -91,7 +94,7 @@ def test_mcnemar_in_closed_form() -> None:
     assert mcnemar(15, 5) == mcnemar(5, 15)
 
 
-def test_paired_difference_is_scipys() -> None:
+def test_paired_difference_is_that_of_scipy() -> None:
     rng = np.random.default_rng(5)
     a = rng.normal(size=60)
     b = a + 0.3 + 0.5 * rng.normal(size=60)
@@ -102,9 +105,13 @@ def test_paired_difference_is_scipys() -> None:
 
 def test_paired_difference_covers() -> None:
     rng = np.random.default_rng(6)
-    result = [paired_difference(np.zeros(40), rng.exponential(size=40)) for _ in range(600)]
-    covered = [one.lower is not None and one.upper is not None and one.lower <= 1.0 <= one.upper for one in result]
-    assert 0.89 < np.mean(covered) < 0.97  # of a skewed law, the t interval is a little short
+    covered = 0
+    for _ in range(600):
+        difference = paired_difference(np.zeros(40), rng.exponential(size=40))
+        assert difference.lower is not None
+        assert difference.upper is not None
+        covered += difference.lower <= 1.0 <= difference.upper
+    assert 0.89 < covered / 600 < 0.97  # of a skewed distribution, the t interval is a little short
 
 
 def test_paired_difference_of_few() -> None:
@@ -120,10 +127,10 @@ def related(x: np.ndarray, y: np.ndarray) -> Dependence | None:
     return dependence(x, y, np.random.default_rng(0))
 
 
-def test_rank_correlation_is_scipys() -> None:
+def test_rank_correlation_is_that_of_scipy() -> None:
     rng = np.random.default_rng(2)
-    x, y = rng.normal(size=200), np.round(rng.normal(size=200), 1)  # with ties
-    y += 0.2 * x
+    x = rng.normal(size=200)
+    y = np.round(rng.normal(size=200), 1) + 0.2 * x
     result = related(x, y)
     expected = stats.spearmanr(x, y)
     assert result is not None
@@ -160,36 +167,51 @@ def test_harm_at_both_ends_is_seen_by_xi_alone(n: int) -> None:
     assert result.xi > 0.25
 
 
-def test_xi_is_scipys_with_its_asymptotic_law() -> None:
+def test_xi_is_that_of_scipy_with_its_asymptotic_distribution() -> None:
     x, y = bowl(300, 2)
-    result, expected = related(x, y), stats.chatterjeexi(x, y)
+    result = related(x, y)
+    expected = stats.chatterjeexi(x, y)
     assert result is not None
     assert (result.xi, result.p_xi, result.flights) == (expected.statistic, expected.pvalue, 300)
 
 
 def test_an_event_that_depends_on_a_number_is_found_and_a_rare_one_by_chance_is_not() -> None:
     """Where the mass is far from 1 on either side; and in 3 of 200 flights, of which two are neighbours."""
-    mass = bowl(200, 3)[0]
-    far = related(mass, (np.abs(mass - 1.0) > 0.15) * 1.0)
-    assert far is not None
-    assert far.p_xi == stats.ks_2samp(mass[np.abs(mass - 1.0) > 0.15], mass[np.abs(mass - 1.0) <= 0.15]).pvalue
-    assert far.p_xi < 1e-6
+    mass, _ = bowl(200, 3)
+    far = np.abs(mass - 1.0) > 0.15
+    found = related(mass, far * 1.0)
+    assert found is not None
+    assert found.p_xi == stats.ks_2samp(mass[far], mass[~far]).pvalue
+    assert found.p_xi < 1e-6
     x = np.arange(200.0)
-    rare = related(x, np.isin(x, (50.0, 51.0, 140.0)) * 1.0)
-    assert rare is not None
-    assert rare.p_xi > 0.05 > stats.chatterjeexi(x, np.isin(x, (50.0, 51.0, 140.0)) * 1.0).pvalue
+    rare = np.isin(x, (50.0, 51.0, 140.0)) * 1.0
+    by_chance = related(x, rare)
+    assert by_chance is not None
+    assert by_chance.p_xi > 0.05 > stats.chatterjeexi(x, rare).pvalue
+
+
+def largest_share(runs: int) -> float:
+    """5 %, and three standard deviations of the share of p values below it that chance gives."""
+    return 0.05 + 3.0 * math.sqrt(0.05 * 0.95 / runs)
 
 
 @pytest.mark.slow("statistics")
 def test_the_p_value_of_xi_has_its_nominal_level() -> None:
     """Of few and many pairs, of numbers, of rare events, and of a varied parameter with few values."""
     rng = np.random.default_rng(3)
+
+    def few_values(size: int) -> np.ndarray:
+        return rng.integers(0, 4, size) * 1.0
+
+    def rare_events(size: int) -> np.ndarray:
+        return (rng.random(size) < 0.1) * 1.0
+
     for n, runs in ((15, 30), (60, 100), (300, 60)):
-        for y_of in (lambda size: rng.normal(size=size), lambda size: (rng.random(size) < 0.1) * 1.0):
-            for x_of in (lambda size: rng.uniform(size=size), lambda size: rng.integers(0, 4, size) * 1.0):
-                result = [dependence(x_of(n), y_of(n), rng) for _ in range(runs)]
-                p = np.array([one.p_xi for one in result if one is not None])
-                assert np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / p.size), (n, p.size)
+        for draw_y in (rng.standard_normal, rare_events):
+            for draw_x in (rng.random, few_values):
+                results = [dependence(draw_x(n), draw_y(n), rng) for _ in range(runs)]
+                p = np.array([result.p_xi for result in results if result is not None])
+                assert np.mean(p < 0.05) < largest_share(p.size), (n, p.size)
 
 
 def test_xi_of_what_is_not_there() -> None:
@@ -204,9 +226,13 @@ MakeCampaign = Callable[..., pa.Table]
 NONE = ("incomplete", "unaudited", "died", "timeout", "memory")
 
 
-def with_column(table: pa.Table, name: str, values: list[object]) -> pa.Table:
-    i = table.column_names.index(name)
-    return table.set_column(i, table.schema.field(i), pa.array(values, table.schema.field(i).type))
+def with_columns(table: pa.Table, columns: dict[str, list[Any]]) -> pa.Table:
+    """A table with other values in some columns."""
+    for name, values in columns.items():
+        i = table.column_names.index(name)
+        field = table.schema.field(i)
+        table = table.set_column(i, field, pa.array(values, field.type))
+    return table
 
 
 @pytest.fixture(scope="module")
@@ -264,10 +290,14 @@ def test_a_constraint_that_lost_flights_did_not_reach_did_not_hold(small: pa.Tab
 
 def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) -> None:
     """Flights 0 and 2 ended before the window of `roll`."""
-    verdicts = ["incomplete" if i in (0, 2) else value for i, value in enumerate(small["verdict"].to_pylist())]
-    held = [None if i in (0, 2) else value for i, value in enumerate(small["satisfied.roll"].to_pylist())]
-    table = with_column(with_column(small, "verdict", verdicts), "satisfied.roll", held)
-    result, before = estimate(table), estimate(small)
+    verdicts = small["verdict"].to_pylist()
+    held = small["satisfied.roll"].to_pylist()
+    for flight in (0, 2):
+        verdicts[flight] = "incomplete"
+        held[flight] = None
+    table = with_columns(small, {"verdict": verdicts, "satisfied.roll": held})
+    before = estimate(small)
+    result = estimate(table)
     assert (result["flights"], result["verdicts"]["incomplete"]) == (8, 2)
     for event in ("failure", "violation"):
         assert result["events"][event]["flights"] == 6
@@ -280,11 +310,12 @@ def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) 
 
 
 def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(small: pa.Table) -> None:
-    table = with_column(with_column(small, "verdict", ["incomplete"] * 8), "failed", [False] * 8)
-    table = with_column(with_column(table, "violated", [False] * 8), "satisfied.roll", [None] * 8)
+    columns = {"verdict": ["incomplete"], "failed": [False], "violated": [False], "satisfied.roll": [None]}
+    table = with_columns(small, {name: 8 * value for name, value in columns.items()})
     result = estimate(table)
     assert verdict_sentence(result).startswith("0 of 0 ")
-    assert result["events"]["failure"]["flights"] == result["constraints"]["roll"]["not_satisfied"]["flights"] == 0
+    assert result["events"]["failure"]["flights"] == 0
+    assert result["constraints"]["roll"]["not_satisfied"]["flights"] == 0
     assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
     with pytest.raises(InputError, match="pair"):
         compare_pairs(table, table, ("one", "other"))
@@ -294,23 +325,25 @@ def test_of_tied_flights_the_first_is_the_worst(thousand: pa.Table) -> None:
     """Margins that are equal but for rounding, as of a wind from either side."""
     rng = np.random.default_rng(0)
     limits = (Limit(name="roll", signal="roll", lower=-5.0, upper=5.0),)
-    table = with_column(thousand.slice(0, 6), "verdict", ["satisfied"] * 6)
-    table = with_column(with_column(table, "failed", [False] * 6), "flight", [5, 1, 4, 2, 3, 0])
+    columns = {"verdict": ["satisfied"] * 6, "failed": [False] * 6, "flight": [5, 1, 4, 2, 3, 0]}
+    table = with_columns(thousand.slice(0, 6), columns)
+
+    def order(flights: pa.Table) -> list[int]:
+        return np.array(flights["flight"])[ranking(flights)].tolist()
+
     for _ in range(20):
         shares = np.array([0.9, 0.2, 0.2, 0.5, 0.2, 0.5]) + 3e-6 * rng.uniform(-1.0, 1.0, 6)
-        shaken = with_column(
-            with_column(table, "worst_margin", shares.tolist()), "margin.roll", (5.0 * shares).tolist()
-        )
-        assert np.array(shaken["flight"])[ranking(shaken)].tolist() == [1, 3, 4, 0, 2, 5]
+        shaken = with_columns(table, {"worst_margin": shares.tolist(), "margin.roll": (5.0 * shares).tolist()})
+        assert order(shaken) == [1, 3, 4, 0, 2, 5]
         assert worst_flight(shaken) == 1
         roll = estimate(shaken, limits)["constraints"]["roll"]
         assert roll["worst_flight"] == 1
         assert roll["worst_margin"] == 5.0 * shares.min()
-        far = with_column(shaken, "worst_margin", [None] * 6)
+        errors: dict[str, list[Any]] = {"worst_margin": [None] * 6}
         for axis in "xyz":
-            errors = np.array([1.0, 3.0, 3.0, 2.0, 3.0, 2.0]) * (1.0 + 3e-6 * rng.uniform(-1.0, 1.0, 6))
-            far = with_column(far, f"rmse.{axis}", errors.tolist())
-        assert np.array(far["flight"])[ranking(far)].tolist() == [1, 3, 4, 0, 2, 5]
+            relative = 1.0 + 3e-6 * rng.uniform(-1.0, 1.0, 6)
+            errors[f"rmse.{axis}"] = (relative * [1.0, 3.0, 3.0, 2.0, 3.0, 2.0]).tolist()
+        assert order(with_columns(shaken, errors)) == [1, 3, 4, 0, 2, 5]
 
 
 def test_the_worst_flights_come_first(small: pa.Table) -> None:
@@ -328,8 +361,7 @@ def test_equal_flights_come_in_the_order_of_their_numbers(small: pa.Table) -> No
 
 
 def test_without_margins_the_largest_error_is_the_worst(small: pa.Table) -> None:
-    free = with_column(small, "worst_margin", [None] * 8).take([0, 2, 7])
-    free = with_column(free, "failed", [False] * 3)
+    free = with_columns(small, {"worst_margin": [None] * 8, "failed": [False] * 8}).take([0, 2, 7])
     assert worst_flight(free) == 7
 
 
@@ -349,18 +381,18 @@ def test_a_lost_flight_without_margin_ranks_below_all(small: pa.Table) -> None:
 def test_what_is_drawn_from_names_has_shares(small: pa.Table) -> None:
     result = estimate(small)["parameters"]["kind"]
     assert result["kind"] == "name"
-    assert {level: (share["count"], share["flights"]) for level, share in result["levels"].items()} == {
-        "a": (2, 4),
-        "b": (4, 4),
-    }
+    a, b = (result["levels"][level] for level in "ab")
+    assert (a["count"], a["flights"]) == (2, 4)
+    assert (b["count"], b["flights"]) == (4, 4)
 
 
 def test_drivers_are_those_that_were_put_in(thousand: pa.Table) -> None:
     result = estimate(thousand)["parameters"]
     tested = {name: entry["worst_margin"] for name, entry in result.items() if entry["kind"] == "number"}
-    assert {name for name, one in tested.items() if one["p_holm"] < 0.05} == {"mass", "wind"}
+    assert {name for name, test in tested.items() if test["p_holm"] < 0.05} == {"mass", "wind"}
     assert tested["wind"]["rho"] < tested["mass"]["rho"] < -0.3
-    assert all(one["p"] <= one["p_holm"] for one in tested.values())
+    for test in tested.values():
+        assert test["p"] <= test["p_holm"]
     assert result["wind"]["failed"]["rho"] > 0.1
     assert set(result["payload"]["levels"]) == {"false", "true"}
 
@@ -368,7 +400,8 @@ def test_drivers_are_those_that_were_put_in(thousand: pa.Table) -> None:
 def test_nothing_goes_with_what_never_happens(make_campaign: MakeCampaign) -> None:
     result = estimate(make_campaign(40, severity=0.0))
     assert result["events"]["failure"]["count"] == 0
-    assert all(entry["failed"] is None for entry in result["parameters"].values() if entry["kind"] == "number")
+    for entry in result["parameters"].values():
+        assert entry["kind"] != "number" or entry["failed"] is None
 
 
 @pytest.mark.parametrize("flights", [0, 1, 2, 5])
@@ -390,24 +423,29 @@ def test_the_summary_of_a_thousand_is_strict_json(thousand: pa.Table) -> None:
 
 def flown(draws: dict[str, Any], margin: np.ndarray, lost: np.ndarray | None = None) -> pa.Table:
     """Flights of such draws and margins; those below 0 violated and failed, and some were lost."""
-    lost = np.zeros(margin.size, bool) if lost is None else lost
-    bad = (margin < 0.0) | lost
-    verdicts = np.where(lost, "lost", np.where(bad, "violated", "satisfied")).tolist()
     n = margin.size
-    return pa.table(
-        {
-            **{"flight": list(range(n)), "verdict": verdicts, "reason": pa.nulls(n, pa.string())},
-            **{"failed": bad, "violated": bad, "crashed": np.zeros(n, bool), "duration": np.ones(n)},
-            **{"worst_margin": margin, "worst_constraint": ["roll"] * n},
-            **{f"draw.{name}": values for name, values in draws.items()},
-        }
-    )
+    if lost is None:
+        lost = np.zeros(n, bool)
+    bad = (margin < 0.0) | lost
+    columns = {
+        "flight": list(range(n)),
+        "verdict": np.where(lost, "lost", np.where(bad, "violated", "satisfied")).tolist(),
+        "reason": pa.nulls(n, pa.string()),
+        "failed": bad,
+        "violated": bad,
+        "crashed": np.zeros(n, bool),
+        "duration": np.ones(n),
+        "worst_margin": margin,
+        "worst_constraint": ["roll"] * n,
+    }
+    return pa.table(columns | {f"draw.{name}": values for name, values in draws.items()})
 
 
 def bowl_table(n: int, seed: int) -> pa.Table:
     rng = np.random.default_rng(seed)
     draws = {name: rng.uniform(0.8, 1.2, n) for name in ("mass", "inertia", "lag", "wind")}
-    return flown(draws, 0.6 - 3.0 * np.abs(draws["mass"] - 1.0) + 0.1 * rng.normal(size=n))
+    margin = 0.6 - 3.0 * np.abs(draws["mass"] - 1.0) + 0.1 * rng.normal(size=n)
+    return flown(draws, margin)
 
 
 @pytest.mark.parametrize("n", [40, 200, 1000])
@@ -422,17 +460,18 @@ def test_harm_at_both_ends_is_reported(n: int) -> None:
     assert (line[0].text, line[1].mark, line[3].mark) == ("mass", "", "best")
 
 
+def outcomes(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """The tests of all varied parameters with the margin and with failure."""
+    return [parameter[outcome] for parameter in result.values() for outcome in ("worst_margin", "failed")]
+
+
 def test_both_measures_are_corrected_together() -> None:
-    result = parameters(bowl_table(400, 5))
-    entries = [
-        (parameter[outcome], key)
-        for parameter in result.values()
-        for outcome in ("worst_margin", "failed")
-        for key in ("p", "p_xi")
-    ]
-    assert len(entries) == 4 * 2 * 2
-    least, key = min(entries, key=lambda entry: entry[0][entry[1]])
-    assert least[f"{key}_holm"] == pytest.approx(16 * least[key])
+    tests = outcomes(parameters(bowl_table(400, 5)))
+    assert len(tests) == 4 * 2
+    pairs = [(test["p"], test["p_holm"]) for test in tests]
+    pairs += [(test["p_xi"], test["p_xi_holm"]) for test in tests]
+    least, corrected = min(pairs)
+    assert corrected == pytest.approx(len(pairs) * least)
 
 
 @pytest.mark.slow("statistics")
@@ -440,26 +479,18 @@ def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None
     """Over 60 campaigns in which nothing matters: any claim, of any measure, varied parameter or outcome."""
     rng = np.random.default_rng(6)
     claims = 0
+    n = 60
     for _ in range(60):
-        n = 60
-        draws = {name: rng.uniform(size=n) for name in ("mass", "lag", "wind", "noise")} | {
-            "horizon": rng.integers(0, 5, n)
-        }
+        draws = {name: rng.uniform(size=n) for name in ("mass", "lag", "wind", "noise")}
+        draws["horizon"] = rng.integers(0, 5, n)
         table = flown(draws, 0.3 + rng.standard_cauchy(n) * 0.2, lost=rng.random(n) < 0.05)
-        result = parameters(table)
-        corrected = [
-            parameter[outcome][key]
-            for parameter in result.values()
-            for outcome in ("worst_margin", "failed")
-            for key in ("p_holm", "p_xi_holm")
-        ]
-        claims += min(corrected) < 0.05
-    assert claims / 60 < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 60)
+        tests = outcomes(parameters(table))
+        claims += min(min(test["p_holm"], test["p_xi_holm"]) for test in tests) < 0.05
+    assert claims / 60 < largest_share(60)
 
 
 def test_without_drivers_none_is_reported(make_campaign: MakeCampaign) -> None:
-    expected = "The worst margin depends on no varied parameter beyond chance."
-    assert driver_sentence(estimate(make_campaign(40, severity=0.0))) == expected
+    assert "depends on no varied parameter" in driver_sentence(estimate(make_campaign(40, severity=0.0)))
 
 
 def test_the_same_table_gives_the_same_numbers(thousand: pa.Table) -> None:

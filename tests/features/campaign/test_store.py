@@ -89,7 +89,8 @@ def test_dying_while_closing_loses_nothing(tmp_path: Path, monkeypatch: pytest.M
         store.append([row(0), row(1)])
         store.close(flights=2)
         store.append([row(2)])
-    write, remove = Growing.write, Growing.remove
+    write = Growing.write
+    remove = Growing.remove
 
     def write_until(self: Growing, contents: Mapping[str, bytes]) -> None:
         for name, content in contents.items():

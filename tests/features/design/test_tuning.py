@@ -44,10 +44,13 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
     """Its gain K (4, n + 4) by differences at hover, of the law that a first scenario has."""
     numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
     data = first_scenario(vehicle, vehicle.name, law=law).to_data() | {"vehicle": {"file": vehicle.name, **numbers}}
-    scenario, tuning, step = parse_scenario(data), design_for(vehicle), 1e-5
+    scenario = parse_scenario(data)
+    tuning = design_for(vehicle)
+    step = 1e-5
     K = np.zeros_like(gain(vehicle, tuning))
     for i in range(N_STATES):
-        state, answers = np.zeros(N_STATES), []
+        state = np.zeros(N_STATES)
+        answers = []
         for state[i] in (step, -step):
             controller = build(scenario.controller, vehicle, tuning.period)
             answers.append(controller.step(StepInputs(), state, np.zeros((controller.horizon, 4))).speeds)
@@ -89,7 +92,8 @@ def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
 def test_a_tilt_grows_in_the_air_by_munks_moment() -> None:
     """In a level glide at 8 m/s, rotors at hover: the plant's own pitch, against exp(p t) + exp(-p t) over 2."""
     vehicle = next(each for each in ALL if each.name == "random-16")
-    rate, tilt = 8.0 * control_authority(vehicle).munk, 1e-3
+    rate = 8.0 * control_authority(vehicle).munk
+    tilt = 1e-3
     with Plant(vehicle, effects=Effects(air=Air(body_drag=vehicle.body_drag))) as plant:
         start = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
         start[INDEX["vx"]] = 8.0
@@ -116,13 +120,18 @@ def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle
 def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
     vehicle = next(each for each in ALL if each.name == "hummingbird")
     tuning = design_for(vehicle)
-    K, margin, step = gain(vehicle, tuning), delay_margin(vehicle, tuning), 1e-3
+    K = gain(vehicle, tuning)
+    margin = delay_margin(vehicle, tuning)
+    step = 1e-3
     A, B = discretise(*continuous_model(vehicle, vehicle.rotor_rise or 0.0), step)
 
     def grows(delay: float) -> bool:
-        x, acting, waiting = np.zeros(len(A)), np.zeros(N_ROTORS), []
+        x = np.zeros(len(A))
+        acting = np.zeros(N_ROTORS)
+        waiting = []
         x[INDEX["x"]] = 1.0
-        last, peaks = np.zeros(N_ROTORS), []
+        last = np.zeros(N_ROTORS)
+        peaks = []
         for i in range(8000):
             if i % round(tuning.period / step) == 0:
                 last = -K @ np.concatenate([x, last])

@@ -34,7 +34,8 @@ EVERY = pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda vehicle: vehicle
 def brute_force(vehicle: Vehicle, row: int) -> tuple[float, float]:
     """Extreme torques over the vertices of {thrust = weight} in the box of squared speeds: all but one at a bound."""
     thrust = vehicle.allocation[0]
-    low, high = vehicle.speed_min**2, vehicle.speed_max**2
+    low = vehicle.speed_min**2
+    high = vehicle.speed_max**2
     torques = []
     for free in range(N_ROTORS):
         others = [i for i in range(N_ROTORS) if i != free]
@@ -62,7 +63,8 @@ def test_torque_authority_is_that_of_the_best_vertex(vehicle: Vehicle) -> None:
 @EVERY
 def test_pure_torques_have_their_closed_forms(vehicle: Vehicle) -> None:
     """Without yaw torque each diagonal pair lifts half the weight; in yaw one pair lifts as much as it can."""
-    weight, top = vehicle.mass * vehicle.gravity, vehicle.thrust_coefficient * vehicle.speed_max**2
+    weight = vehicle.mass * vehicle.gravity
+    top = vehicle.thrust_coefficient * vehicle.speed_max**2
     swing = min(0.5 * weight, 2.0 * top - 0.5 * weight)  # between the two rotors of a pair
     pairs = 2.0 if abs(vehicle.rotor_azimuths[0]) == 45.0 else 1.0
     lean = math.cos(math.radians(45.0)) if pairs == 2.0 else 1.0
@@ -75,7 +77,8 @@ def test_pure_torques_have_their_closed_forms(vehicle: Vehicle) -> None:
 @EVERY
 def test_hover_figures_have_their_closed_forms(vehicle: Vehicle) -> None:
     sheet = make_sheet(vehicle)
-    b, weight = vehicle.thrust_coefficient, vehicle.mass * vehicle.gravity
+    b = vehicle.thrust_coefficient
+    weight = vehicle.mass * vehicle.gravity
     lift = 4.0 * b * vehicle.speed_max**2
     assert sheet.weight == weight
     assert 4.0 * b * sheet.hover_speed**2 == pytest.approx(weight)
@@ -140,7 +143,8 @@ def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.Captur
 def test_what_is_left_of_the_example_is_told_by_the_report_and_before_a_flight(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    template, file = quadsim.vehicle_report(template=True).content, tmp_path / "mine.toml"
+    template = quadsim.vehicle_report(template=True).content
+    file = tmp_path / "mine.toml"
     count = len(re.findall(r'(?m)^source = "example"$', template))
     text = template.replace('source = "example"', 'source = "weighed"', 1)  # of the mass
     file.write_text(text, encoding="utf-8")
@@ -180,7 +184,8 @@ def test_a_vehicle_whose_autopilot_has_no_lag_is_reported_and_flies(
     field: str, value: str, axis: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["vehicle", "--template"]) == EXIT_DONE
-    template, file = capsys.readouterr().out, tmp_path / "slow.toml"
+    template = capsys.readouterr().out
+    file = tmp_path / "slow.toml"
     text, count = re.subn(rf"(?m)^(\[{field}\]\nvalue = ).*", rf"\g<1>{value}", template)
     assert count == 1
     file.write_text(text, encoding="utf-8")

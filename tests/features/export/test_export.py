@@ -41,7 +41,9 @@ NOT_EXPORTED = {
 
 
 def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
-    exported, refused, seen = 0, {}, set()
+    exported = 0
+    refused = {}
+    seen = set()
     for name in read_catalogue().scenarios:
         scenario = load_scenario(name)
         key = repr(scenario.controller), repr(asdict(Assembly(scenario).vehicle)), bool(scenario.obstacles)
@@ -191,9 +193,11 @@ def test_nan_and_infinity_are_refused(value: float) -> None:
 
 def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
     """W (N, m) by the passes that the C makes."""
-    N, n = len(axis.K), len(axis.B)
+    N = len(axis.K)
+    n = len(axis.B)
     pull = np.array([(axis.W if i < N - 1 else axis.W_end) @ row[axis.regulated] for i, row in enumerate(reference)])
-    w, slope = np.empty((N, axis.inputs)), pull[-1].reshape(n)
+    w = np.empty((N, axis.inputs))
+    slope = pull[-1].reshape(n)
     for i in reversed(range(N)):
         w[i] = axis.inverse[i] @ axis.B.T @ slope
         if i:
@@ -211,8 +215,10 @@ def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
 def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None:
     scenario = load_scenario("paper-constrained", settings)
     problem = Assembly(scenario).problem()
-    result, rng = tables(problem), np.random.default_rng(0)
-    state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
+    result = tables(problem)
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=12)
+    reference = rng.normal(size=(problem.horizon, 4))
     query = Query(1e-6 * state, problem.desired(1e-6 * reference), problem.model.u_bar)
     answer = Core(problem).solve(query)
     assert answer.method is Method.FREE
@@ -227,8 +233,10 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
 def test_responses_are_those_of_the_condensed_problem(name: str) -> None:
     scenario = load_scenario(name, ["controller.horizon=8"])
     problem = exported_law(scenario).problem
-    result, form = tables(problem), Condensed(problem)
-    N, m = problem.horizon, len(result.rows)
+    result = tables(problem)
+    form = Condensed(problem)
+    N = problem.horizon
+    m = len(result.rows)
     inputs = N * problem.model.nu
     rows = form._values.of_inputs  # of the general rows; those of single inputs are a box
     H_inverse = np.linalg.inv(np.asarray(form.cost.H))

@@ -40,7 +40,8 @@ def short(name: str, duration: float = 1.0, **changes: Any) -> quadsim.Scenario:
 def flown(env: gymnasium.Env[Any, Any], seed: int | None = None) -> list[dict[str, Any]]:
     """An episode of the scenario's own controller: `info` of the start and of each step."""
     _, info = env.reset(seed=seed)
-    infos, ended = [info], False
+    infos = [info]
+    ended = False
     while not ended:
         observed, reward, terminated, truncated, info = env.step(env.unwrapped.controller_action())
         assert observed in env.observation_space
@@ -279,7 +280,8 @@ def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
     observed, _ = env.reset()
     for _ in range(10):
         observed = env.step(np.array([0.2, 0.1, -0.05, 0.1], np.float32))[0]
-    plant, vehicle = env.flight().log.plant, env.started.vehicle
+    plant = env.flight().log.plant
+    vehicle = env.started.vehicle
     body = env.started.observation.moment.body_rates
     assert body == pytest.approx([0.6, -0.3, 0.2], abs=0.02)
     thrust = vehicle.thrust_coefficient * np.sum(plant.speeds[-2] ** 2)
@@ -346,7 +348,8 @@ class Clip:
     """As much of moviepy as gymnasium calls; moviepy itself wants another Pillow than the rest."""
 
     def __init__(self, frames: list[np.ndarray], fps: float) -> None:
-        self.frames, self.fps = frames, fps
+        self.frames = frames
+        self.fps = fps
 
     def write_videofile(self, path: str, logger: object) -> None:
         imageio.v2.mimwrite(path, self.frames, fps=self.fps)

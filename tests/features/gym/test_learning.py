@@ -29,7 +29,8 @@ pytestmark = pytest.mark.slow("gym")
 def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[str, Any]], bool]:
     env.reset(seed=seed)
     env.action_space.seed(seed)
-    infos, ended = [], False
+    infos = []
+    ended = False
     while not ended:
         _, _, terminated, truncated, info = env.step(env.action_space.sample())
         infos.append(info)
@@ -60,7 +61,8 @@ def test_the_guides_filter_protects_to_the_end_of_the_episode() -> None:
     (block,) = [text for text in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "MPCSafetyFilter(" in text]
     names: dict[str, Any] = {"quadsim": quadsim}
     exec(block.replace("env.close()", ""), names)  # it is flown once more below
-    env, safe = names["env"], names["safe"]
+    env = names["env"]
+    safe = names["safe"]
     flight = env.unwrapped.flight()
     assert env.steps == flight.time.size == round(safe.duration / safe.control_period)
     assert names["violations"] == 0
@@ -227,7 +229,8 @@ def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_teacher_labels_its_own_flight_and_the_students() -> None:
-    scenario, hover = imitation.course(0).replace({"duration": 1.0}), quadsim.load_vehicle("lopes2011").hover_speed
+    scenario = imitation.course(0).replace({"duration": 1.0})
+    hover = quadsim.load_vehicle("lopes2011").hover_speed
     own = imitation.Lesson(scenario, hover)
     flight = quadsim.fly(scenario, controller=own, progress=False)
     assert np.array_equal(flight.command, quadsim.fly(scenario, progress=False).command)

@@ -68,7 +68,8 @@ def test_the_reward_of_tracking_is_largest_on_the_reference_and_never_negative()
 def test_the_gradient_of_a_network_is_that_of_finite_differences() -> None:
     rng = np.random.default_rng(0)
     layers = [part.astype(np.float64) for part in ppo.make_layers(rng, (5, 4, 3, 2), 1.0)]
-    inputs, slope = rng.standard_normal((7, 5)), rng.standard_normal((7, 2))
+    inputs = rng.standard_normal((7, 5))
+    slope = rng.standard_normal((7, 2))
     gradient = ppo.backward(layers, ppo.forward(layers, inputs), slope)
     step = 1e-6
     for part, expected in zip(layers, gradient, strict=True):
@@ -95,13 +96,15 @@ def test_running_moments_are_those_of_everything_seen() -> None:
 def test_advantages_are_discounted_sums_that_end_with_the_episode() -> None:
     learner = ppo.Learner(small_envs(), SMALL)
     rng = np.random.default_rng(0)
-    length, count = 6, 2
+    length = 6
+    count = 2
     rollout = ppo.Rollout()
     rollout.rewards = list(rng.random((length, count)))
     rollout.values = list(rng.random((length + 1, count)))
     rollout.ended = [np.array([False, t == 3]) for t in range(length)]
     rollout.values_at_end = [np.where(ended, 0.7, 0.0) for ended in rollout.ended]
-    discount, trace = SMALL.discount, SMALL.trace
+    discount = SMALL.discount
+    trace = SMALL.trace
     expected = np.zeros((length, count))
     for i in range(count):
         for t in range(length):

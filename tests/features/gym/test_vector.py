@@ -86,7 +86,8 @@ def test_each_environment_is_a_single_one_bit_for_bit(case: str, action: str) ->
         for place, env in enumerate(singles):
             if over[place]:
                 expected, info = env.reset()
-                reward, ends = 0.0, (False, False)
+                reward = 0.0
+                ends = (False, False)
             else:
                 expected, reward, *ends, info = env.step(actions[place])
             assert np.array_equal(observed[place], expected, equal_nan=True)
@@ -102,7 +103,8 @@ def flown(count: int, threads: int = 1, **options: Any) -> tuple[Array, Array]:
     """Observations and rewards of the first three of some environments."""
     scenario = short("hummingbird-figure-eight", 0.5, **DISTURBED, **{"plant.integrator": "rk4"})
     envs = quadsim.gym.make_vec(scenario, count, threads=threads, **options)
-    observations, rewards = [envs.reset(seed=3)[0][:3]], []
+    observations = [envs.reset(seed=3)[0][:3]]
+    rewards = []
     for step in range(25):
         actions = np.full((count, 4), 0.1 * np.sin(step), np.float32)
         observed, reward, *_ = envs.step(actions)
@@ -126,8 +128,10 @@ def test_every_action_is_flown_as_by_a_single_environment(action: str) -> None:
     scenario = short("hummingbird-figure-eight", 0.5, **{"plant.integrator": "rk4"})
     envs = quadsim.gym.make_vec(scenario, 2, action=action)
     env = quadsim.gym.QuadrotorEnv(scenario, action=action)
-    observed, start = envs.reset(seed=0)[0], env.reset(seed=0)[0]
-    low, high = envs.single_action_space.low, envs.single_action_space.high
+    observed = envs.reset(seed=0)[0]
+    start = env.reset(seed=0)[0]
+    low = envs.single_action_space.low
+    high = envs.single_action_space.high
     rng = np.random.default_rng(1)
     for _ in range(10):
         assert np.array_equal(observed[0], start)
@@ -302,7 +306,8 @@ def test_a_bad_number_has_the_reason_that_a_single_environment_gives(action: str
     envs.reset(seed=0)
     env.reset(seed=0)
     wrong = np.full((2, 4), np.nan)
-    info, infos = env.step(wrong[0])[4], envs.step(wrong)[4]
+    info = env.step(wrong[0])[4]
+    infos = envs.step(wrong)[4]
     assert infos["reason"][0] == info["reason"]
     assert "not finite" in info["reason"]
     envs.close()

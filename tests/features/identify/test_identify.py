@@ -83,7 +83,8 @@ def estimate(
 
 
 def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) -> None:
-    true, found = quadsim.load_vehicle(TRUE), identified.vehicle
+    true = quadsim.load_vehicle(TRUE)
+    found = identified.vehicle
     assert found.thrust_coefficient == pytest.approx(true.thrust_coefficient, rel=0.02)
     assert found.inertia[:2] == pytest.approx(true.inertia[:2], rel=0.05)
     errors = identified.prediction.errors
@@ -93,7 +94,8 @@ def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) 
 
 def test_the_file_loads_flies_and_says_where_each_number_is_from(identified: IdentifiedVehicle) -> None:
     assert identified.file is not None
-    written, sources = load_vehicle(identified.file), vehicle_sources(identified.file)
+    written = load_vehicle(identified.file)
+    sources = vehicle_sources(identified.file)
     assert written.thrust_coefficient == pytest.approx(identified.vehicle.thrust_coefficient, rel=1e-3)
     assert written.inertia == pytest.approx(identified.vehicle.inertia, rel=1e-3)
     assert re.fullmatch(
@@ -161,7 +163,9 @@ def test_what_a_gate_refuses_keeps_the_number_of_the_start_and_says_why(place: P
     identification = Identification(estimates=estimates, vehicle=new, delay=0.0, offset=(0.0, 0.0))
     path = place / "refused.toml"
     path.write_text(vehicle_text(identification, place / "start.toml", ["a.csv", "b.csv"]), encoding="utf-8")
-    written, sources, before = load_vehicle(path), vehicle_sources(path), vehicle_sources(place / "start.toml")
+    written = load_vehicle(path)
+    sources = vehicle_sources(path)
+    before = vehicle_sources(place / "start.toml")
     assert written.inertia == (0.0071, 0.0072, 0.0139)
     assert written.drag_to_thrust == start.drag_to_thrust
     assert sources["drag_to_thrust"] == f"kept: no yaw excitation; {before['drag_to_thrust']}"
@@ -171,7 +175,8 @@ def test_what_a_gate_refuses_keeps_the_number_of_the_start_and_says_why(place: P
 
 
 def test_an_identified_coefficient_takes_the_place_of_a_map(place: Path) -> None:
-    start, path = published("cf21b"), place / "unmapped.toml"
+    start = published("cf21b")
+    path = place / "unmapped.toml"
     assert number_in(start, "thrust_coefficient") == start.mean_coefficient
     thrust = estimate("thrust_coefficient", 3.9e-8, start.mean_coefficient)
     for refused in ("", "not excited"):
@@ -185,9 +190,11 @@ def test_an_identified_coefficient_takes_the_place_of_a_map(place: Path) -> None
 def test_a_throttle_map_gives_the_speeds_of_the_throttle() -> None:
     start = load_vehicle(vehicle_path(TRUE))
     top = start.mean_coefficient * start.speed_max**2
-    mapped, u = altered(start, {"thrust_of_throttle": (0.4 * top, 0.6 * top)}), np.linspace(0.1, 1.0, 40)
+    mapped = altered(start, {"thrust_of_throttle": (0.4 * top, 0.6 * top)})
+    u = np.linspace(0.1, 1.0, 40)
     columns = {name: np.zeros((40, 3)) for name in ("rates", "velocity")}
-    throttle, level = np.stack([u] * 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
+    throttle = np.stack([u] * 4, axis=1)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
     record = Record(name="a", t=0.01 * np.arange(40), attitude=level, throttle=throttle, **columns)
     speeds = demanded_speeds(record, mapped, Parameters.of(mapped))
     np.testing.assert_allclose(mapped.thrusts(speeds), top * (0.4 * throttle + 0.6 * throttle**2), rtol=1e-12)
@@ -252,12 +259,14 @@ def test_values_have_the_digits_of_their_intervals() -> None:
 
 
 def test_the_true_vehicle_predicts_and_rates_are_held(eight: Flight, place: Path) -> None:
-    true, wrong = load_vehicle(vehicle_path(TRUE)), load_vehicle(place / "start.toml")
+    true = load_vehicle(vehicle_path(TRUE))
+    wrong = load_vehicle(place / "start.toml")
     record = read_record(place / "eight.csv")
     identification = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
     found = predict([record], [[slice(100, len(record.t))]], identification, wrong)
     noise = np.array([1e-3, 1e-2, 0.0, 1e-2]) * np.sqrt(8.0 / np.pi)  # mean norm of three normal numbers
-    at_start, after = found.errors["identified"][1], found.errors["identified"][-1]
+    at_start = found.errors["identified"][1]
+    after = found.errors["identified"][-1]
     assert (at_start < 2.0 * noise + [1e-3, 1e-3, 3e-3, 1e-2]).all()
     assert (after < 0.1 * found.errors["start"][-1] + 3.0 * noise + [0.01, 0.02, 0.01, 0.02]).all()
     held = found.trace.predicted["rates held"][..., 3:]
@@ -272,14 +281,16 @@ def test_the_true_vehicle_predicts_and_rates_are_held(eight: Flight, place: Path
 
 def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
     """In place of a flight with them: what they change in a prediction by the true vehicle."""
-    true, record = load_vehicle(vehicle_path(TRUE)), read_record(place / "eight.csv")
+    true = load_vehicle(vehicle_path(TRUE))
+    record = read_record(place / "eight.csv")
     known = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
 
     def end(**changes: object) -> np.ndarray:
         changed = replace(known, **changes)  # type: ignore[arg-type]
         return predict([record], [[slice(300, 360)]], changed, true).trace.predicted["identified"][0, -1]
 
-    still, t = end(), 0.5
+    still = end()
+    t = 0.5
     weight = true.mass * true.gravity
     pitched = (end(offset=(1e-5, 0.0)) - still)[4]  # in front of the rotors' centre: nose down
     assert pitched == pytest.approx(1e-5 * weight * t / true.inertia[1], rel=0.2)

@@ -256,7 +256,7 @@ def test_throttle_alone_shows_thrust_only_for_the_highest_speed_as_kept() -> Non
     assert len(wrong(found, throttle_curve=0.7)) <= 1  # of 17 intervals of 95 %
     known = by_name(found)
     for name in ("thrust_coefficient", "rotor_inertia", "rotor_drag"):
-        assert known[name].refused == "a log of the throttle shows it only for the highest speed of 1089.4 rad/s, kept"
+        assert "1089.4 rad/s" in known[name].refused
     assert "voltage_exponent" not in known
     full = found.vehicle.thrust_coefficient * start.speed_max**2
     assert full == pytest.approx(TRUE.thrust_coefficient * START.speed_max**2, rel=0.15)
@@ -300,9 +300,11 @@ def test_throttle_and_speeds_give_the_rotors_answer_and_then_the_forces() -> Non
 def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     """Its noise is that of a cheap one."""
     flight = flown(air=True)
-    record, log = record_of(flight), flight.log
+    record = record_of(flight)
+    log = flight.log
     stride = (len(log.plant.t) - 1) // len(log.control.t)
-    state, step = log.plant.state, log.plant.t[1] - log.plant.t[0]
+    state = log.plant.state
+    step = log.plant.t[1] - log.plant.t[0]
     change = np.gradient(state[:, VELOCITIES], step, axis=0)[:-1:stride]
     change[:, 2] += TRUE.gravity
     force = to_world(conjugate(euler_to_quaternion(state[:-1:stride, ANGLES])), change)
@@ -311,7 +313,8 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     series = {name: Column(t=record.t, values=np.asarray(getattr(record, name))) for name in fields}
     read = to_record("imu", series | {"specific_force": Column(t=record.t, values=force)})
     assert read.inertial
-    assert read.notes == ("imu: no velocity is logged; the accelerometer stands in for it",)
+    (note,) = read.notes
+    assert note.startswith("imu: no velocity is logged")
     found = identify(read)
     moments = {f"{name}_{axis}": v for name, of in MOMENTS.items() for axis, v in zip("xyz", of, strict=False)}
     assert not wrong(found, **moments, inflow=INFLOW)

@@ -56,7 +56,9 @@ def drawn(noise: AxisNoise, samples: int, seed: int) -> Array:
 @pytest.mark.parametrize("noise", NOISES)
 def test_forecasts_are_those_of_a_kalman_filter(noise: AxisNoise) -> None:
     """Of rate and acceleration, in state space: transition by the matrix exponential, covariances by Van Loan."""
-    s, T, r = noise.deviation, noise.time, noise.sensor
+    s = noise.deviation
+    T = noise.time
+    r = noise.sensor
     continuous = np.array([[0.0, 1.0], [0.0, -1.0 / T]])
     intensity = np.diag([0.0, 2.0 * s**2 / T])
     loan = expm(np.block([[-continuous, intensity], [np.zeros((2, 2)), continuous.T]]) * PERIOD)

@@ -24,7 +24,8 @@ from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(vehicle_path("hummingbird"))
-RISE, FALL = 0.0125, 0.025
+RISE = 0.0125
+FALL = 0.025
 FIELDS = ("position", "velocity", "attitude", "rates", "commands", "speeds")
 
 

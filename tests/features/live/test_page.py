@@ -13,7 +13,7 @@ import time as clock
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -72,7 +72,9 @@ PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> None:
     guard = Guard("127.0.0.1")
     filled = {name: value.replace("{token}", guard.token) for name, value in headers.items()}
-    assert (guard.refusal(filled, "/" + query.replace("{token}", guard.token), 8080) is None) == let_in
+    path = "/" + query.replace("{token}", guard.token)
+    refused = guard.refusal(filled, path, 8080) is not None
+    assert refused != let_in
 
 
 @pytest.mark.parametrize(
@@ -98,12 +100,16 @@ def test_cookies_of_other_programs_on_this_host_lock_nobody_out(others: str) -> 
 
     def refusal(*cookies: str, hosts: tuple[str, ...] = ("127.0.0.1:8080",)) -> str | None:
         headers = Headers()
-        for name, value in (*(("Host", host) for host in hosts), *(("Cookie", line) for line in cookies)):
-            headers.set_insecure(name, value)  # as the library does with what it has received
+        for host in hosts:
+            headers.set_insecure("Host", host)  # as the library does with what it has received
+        for cookie in cookies:
+            headers.set_insecure("Cookie", cookie)
         return guard.refusal(headers, "/", 8080)
 
-    assert refusal(f"{others}; {ours}") is refusal(f"{ours}; {others}") is refusal(others, ours) is None
+    assert refusal(f"{others}; {ours}") is None
+    assert refusal(f"{ours}; {others}") is None
     assert refusal(f"{others};{ours}") is None
+    assert refusal(others, ours) is None
     assert refusal(others) is not None
     assert refusal(ours, hosts=("127.0.0.1:8080", "evil.example")) == "a header is there twice"
 
@@ -153,47 +159,78 @@ class Served:
             assert clock.monotonic() < limit
             clock.sleep(0.02)
 
+    def wait_for_periods(self, count: int) -> None:
+        k = self.session.k
+        self.wait(lambda: self.session.k > k + count)
+
+    @property
+    def url(self) -> str:
+        """The address of the page's web socket."""
+        return f"ws://{urlsplit(self.page.address).netloc}/"
+
+    @property
+    def cookie(self) -> dict[str, str]:
+        """The header by which a browser that has opened the page is known."""
+        address = urlsplit(self.page.address)
+        token = address.query.partition("=")[2]
+        return {"Cookie": f"quadsim-{address.port}={token}"}
+
+    def connect(self, **headers: str) -> Any:
+        """Open the web socket as a browser does, with its cookie and other headers."""
+        return connect(
+            self.url,
+            subprotocols=[PROTOCOL],
+            additional_headers=self.cookie | headers,
+            max_size=None,
+            close_timeout=0.2,
+        )
+
+    @contextmanager
+    def driven(self) -> Iterator[threading.Thread]:
+        """Fly in a thread until the end of the block."""
+        thread = threading.Thread(target=self.pace.drive, args=(self.session, self.page))
+        thread.start()
+        try:
+            yield thread
+        finally:
+            self.pace.stop()
+            thread.join()
+
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    target, saves = tmp_path_factory.mktemp("live") / "saved", threading.Event()
+    target = tmp_path_factory.mktemp("live") / "saved"
+    saves = threading.Event()
 
     def save(flight: Flight) -> str:
         saves.wait(PATIENCE)
         flight.save(target, video=False, recording=False, figures=False)
         return str(target)
 
-    session, pace = Session(load_scenario("hover", ["controller.horizon=10"])), Pace(waiting=True)
-    page = Page(session, pace, save=save, others={"PID": load_scenario("hover", ["controller=pid"]).controller})
-    thread = threading.Thread(target=pace.drive, args=(session, page))
-    thread.start()
-    yield Served(session, pace, page, saves)
-    pace.stop()
-    thread.join()
+    pid = load_scenario("hover", ["controller=pid"]).controller
+    session = Session(load_scenario("hover", ["controller.horizon=10"]))
+    pace = Pace(waiting=True)
+    page = Page(session, pace, save=save, others={"PID": pid})
+    served = Served(session, pace, page, saves)
+    with served.driven():
+        yield served
     page.close()
     session.close()
 
 
 @pytest.mark.usefixtures("tab")
 def test_ten_clients_are_served_and_foreign_ones_are_not(served: Served) -> None:
-    address = urlsplit(served.page.address)
-    url, own = f"ws://{address.netloc}/", f"http://{address.netloc}"
-    cookie = {"Cookie": f"quadsim-{address.port}={address.query.partition('=')[2]}"}
-    for headers in ({}, {**cookie, "Origin": "http://evil.example"}, {**cookie, "Host": "evil.example"}):
+    foreign = {"Origin": "http://evil.example"}
+    for headers in ({}, served.cookie | foreign, served.cookie | {"Host": "evil.example"}):
         with pytest.raises(InvalidStatus, match="403"):
-            connect(url, subprotocols=[PROTOCOL], additional_headers=headers)
-    own_page = {**cookie, "Origin": own}
+            connect(served.url, subprotocols=[PROTOCOL], additional_headers=headers)
+    own = f"http://{urlsplit(served.page.address).netloc}"
     with ExitStack() as stack:
-        clients = [
-            stack.enter_context(
-                connect(url, subprotocols=[PROTOCOL], additional_headers=own_page, max_size=None, close_timeout=0.2)
-            )
-            for _ in range(10)
-        ]
-        k = served.session.k
+        clients = [stack.enter_context(served.connect(Origin=own)) for _ in range(10)]
         for client in clients:
-            assert all(client.recv(timeout=PATIENCE) for _ in range(3))
-        served.wait(lambda: served.session.k > k + 10)
+            for _ in range(3):
+                assert client.recv(timeout=PATIENCE)
+        served.wait_for_periods(10)
 
 
 @pytest.mark.parametrize(
@@ -206,10 +243,8 @@ def test_ten_clients_are_served_and_foreign_ones_are_not(served: Served) -> None
 def test_where_no_page_can_be_served_is_refused(
     option: str, value: str, rule: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        main(["live", "hover", "--no-browser", f"{option}={value}", "--out", str(tmp_path / "live")])
-        == EXIT_WRONG_INPUT
-    )
+    status = main(["live", "hover", "--no-browser", f"{option}={value}", "--out", str(tmp_path / "live")])
+    assert status == EXIT_WRONG_INPUT
     assert rule in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -219,7 +254,8 @@ def test_an_interrupt_keeps_what_was_flown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By the signal itself, with Python's handler: a process that a shell started in the background ignores it."""
-    show, threads = Page.show, {*threading.enumerate()}
+    show = Page.show
+    threads = {*threading.enumerate()}
 
     def interrupted(page: Page, frame: Frame, factor: float) -> None:
         show(page, frame, factor)
@@ -272,7 +308,6 @@ def test_a_fault_of_the_page_loses_no_flight(tmp_path: Path, monkeypatch: pytest
 
 
 CAMERA = {
-    "type": "ViewerCameraMessage",
     "wxyz": [1.0, 0.0, 0.0, 0.0],
     "position": [3.0, 3.0, 3.0],
     "fov": 0.8,
@@ -283,24 +318,21 @@ CAMERA = {
     "look_at": [0.0, 0.0, 0.0],
     "up_direction": [0.0, 0.0, 1.0],
 }
-HOSTILE: tuple[Any, ...] = (
-    *(math.nan, math.inf, -1, -math.inf, 1e308, 2**62, "x", "0", "nan", None, [], {"a": 1}, b"x", True),
-    *([1e308, math.nan], [math.nan] * 3, [1.0] * 7),
-)
+NUMBERS = (math.nan, math.inf, -1, -math.inf, 1e308, 2**62)
+OTHERS = ("x", "0", "nan", None, [], {"a": 1}, b"x", True, [1e308, math.nan], [math.nan] * 3, [1.0] * 7)
+HOSTILE: tuple[Any, ...] = NUMBERS + OTHERS
 
 
 @pytest.fixture
 def flying() -> Iterator[Served]:
     """A session that flies, whatever is sent to its page."""
-    session, pace = Session(load_scenario("playground", ["controller.horizon=5"])), Pace()
+    session = Session(load_scenario("playground", ["controller.horizon=5"]))
+    pace = Pace()
     page = Page(session, pace, save=lambda flight: "", others={})
-    thread = threading.Thread(target=pace.drive, args=(session, page))
-    thread.start()
     served = Served(session, pace, page, threading.Event())
-    yield served
-    alive = thread.is_alive()
-    pace.stop()
-    thread.join()
+    with served.driven() as thread:
+        yield served
+        alive = thread.is_alive()
     page.close()
     session.close()
     assert alive
@@ -308,33 +340,23 @@ def flying() -> Iterator[Served]:
 
 def joined(served: Served, stack: ExitStack) -> Callable[..., None]:
     """Open a page by hand; a function that sends a message from it."""
-    address = urlsplit(served.page.address)
-    cookie = {"Cookie": f"quadsim-{address.port}={address.query.partition('=')[2]}"}
     clients = len(served.page._server.get_clients())
-    page = stack.enter_context(
-        connect(
-            f"ws://{address.netloc}/",
-            subprotocols=[PROTOCOL],
-            additional_headers=cookie,
-            max_size=None,
-            close_timeout=0.2,
-        )
-    )
+    page = stack.enter_context(served.connect())
 
-    def send(kind: str, **fields: Any) -> None:
-        page.send(msgspec.msgpack.encode({"type": kind, **fields}))
+    def send(message: str, **fields: Any) -> None:
+        page.send(msgspec.msgpack.encode({"type": message, **fields}))
 
-    send(**{"kind" if key == "type" else key: value for key, value in CAMERA.items()})
+    send("ViewerCameraMessage", **CAMERA)
     served.wait(lambda: len(served.page._server.get_clients()) > clients)
     return send
 
 
 def test_hostile_values_change_nothing_and_end_nothing(flying: Served) -> None:
     widgets = flying.page._server.gui._gui_input_handle_from_uuid
+    start = {uuid: widget.value for uuid, widget in widgets.items() if not widget._impl.is_button}
+    (speed,) = [uuid for uuid, widget in widgets.items() if getattr(widget, "label", "") == "Speed"]
     with ExitStack() as stack:
         send = joined(flying, stack)
-        buttons = {uuid for uuid, widget in widgets.items() if widget._impl.is_button}
-        start = {uuid: widget.value for uuid, widget in widgets.items() if uuid not in buttons}
         for uuid, value in start.items():
             for hostile in HOSTILE:
                 if not offers(widgets[uuid], hostile):
@@ -342,35 +364,31 @@ def test_hostile_values_change_nothing_and_end_nothing(flying: Served) -> None:
             send("GuiUpdateMessage", uuid=uuid, updates={"value": value, "visible": False})
             send("GuiUpdateMessage", uuid=uuid, updates={"_impl": None})
         for name, value in {"position": [math.nan] * 3, "fov": math.inf, "look_at": [1e308] * 3}.items():
-            send(**{"kind" if key == "type" else key: entry for key, entry in (CAMERA | {name: value}).items()})
+            send("ViewerCameraMessage", **CAMERA | {name: value})
         send("TransformControlsUpdateMessage", name="/target", wxyz=[1.0, 0.0, 0.0, 0.0], position=[math.nan] * 3)
-        speed = next(uuid for uuid, widget in widgets.items() if getattr(widget, "label", "") == "Speed")
         send("GuiUpdateMessage", uuid=speed, updates={"value": "0"})
         send("GuiUpdateMessage", uuid=speed, updates={"value": "2"})
         flying.wait(lambda: flying.pace.speed == 2.0)
-        k = flying.session.k
-        flying.wait(lambda: flying.session.k > k + 5)
-    assert {uuid: widgets[uuid].value for uuid in start if uuid != speed} == {
-        uuid: value for uuid, value in start.items() if uuid != speed
-    }
-    assert widgets[speed].value == "2"
+        flying.wait_for_periods(5)
+    assert {uuid: widgets[uuid].value for uuid in start} == start | {speed: "2"}
 
 
 def test_a_watching_page_changes_nothing_that_the_driver_gives(flying: Served) -> None:
     widgets = flying.page._server.gui._gui_input_handle_from_uuid
     by_label = {getattr(widget, "label", ""): uuid for uuid, widget in widgets.items()}
-    payload, take = by_label["Payload [kg]"], by_label["Take payload"]
+    payload = by_label["Payload [kg]"]
+    take = by_label["Take payload"]
     before = widgets[payload].value
     with ExitStack() as stack:
-        drive, watch = joined(flying, stack), joined(flying, stack)
+        drive = joined(flying, stack)
+        watch = joined(flying, stack)
         watch("GuiUpdateMessage", uuid=payload, updates={"value": 0.5 * before})
         watch("GuiUpdateMessage", uuid=by_label["Speed"], updates={"value": "4"})
         watch("GuiUpdateMessage", uuid=take, updates={"value": True})
         watch("GuiUpdateMessage", uuid=by_label["Camera follows"], updates={"value": False})
         drive("GuiUpdateMessage", uuid=by_label["Speed"], updates={"value": "2"})
         flying.wait(lambda: flying.pace.speed == 2.0)
-        k = flying.session.k
-        flying.wait(lambda: flying.session.k > k + 5)
+        flying.wait_for_periods(5)
         assert not flying.events("payload_pickup")
         drive("GuiUpdateMessage", uuid=take, updates={"value": True})
         flying.wait(lambda: bool(flying.events("payload_pickup")))
@@ -387,7 +405,8 @@ def windy() -> Iterator[Served]:
         "effects.rotors": {"rise": 0.015, "fall": 0.025, "efficiency": [0.9, 1.0, 1.0, 1.0]},
     }
     scenario = load_scenario("playground", ["controller.horizon=10"]).replace(effects)
-    session, pace = Session(scenario), Pace(waiting=True)
+    session = Session(scenario)
+    pace = Pace(waiting=True)
     page = Page(session, pace, save=lambda flight: "", others={})
     yield Served(session, pace, page, threading.Event())
     page.close()
@@ -395,14 +414,16 @@ def windy() -> Iterator[Served]:
 
 
 def test_disturbances_show_what_acts_and_change_only_what_was_given(windy: Served) -> None:
-    session, page = windy.session, windy.page
+    session = windy.session
+    page = windy.page
     fields = {label: widget for label, (widget, *_) in page._widgets._shown.items()}
 
     def shown() -> dict[str, Any]:
         return {label: widget.value for label, widget in fields.items()}
 
     def give(label: str, value: Any) -> None:
-        page._driver, fields[label].value = 1, value
+        page._driver = 1
+        fields[label].value = value
         event = SimpleNamespace(client=SimpleNamespace(client_id=1), client_id=1, target=fields[label])
         for called in fields[label]._impl.update_cb:
             asyncio.run_coroutine_threadsafe(called(event), page._server.gui._event_loop).result(PATIENCE)
@@ -416,7 +437,10 @@ def test_disturbances_show_what_acts_and_change_only_what_was_given(windy: Serve
         "Wind x, y [m/s]": (4.0, 0.0),
         "Mass factor": 1.1,
         "Rotor lag up, down [ms]": (15.0, 25.0),
-        **{f"Rotor {rotor} loss": 0.1 if rotor == 1 else 0.0 for rotor in range(1, 5)},
+        "Rotor 1 loss": 0.1,
+        "Rotor 2 loss": 0.0,
+        "Rotor 3 loss": 0.0,
+        "Rotor 4 loss": 0.0,
     }
     fly(1)
     given = {"Wind x, y [m/s]": (4.0, -2.0), "Rotor lag up, down [ms]": (15.0, 30.0), "Rotor 1 loss": 0.19}
@@ -424,12 +448,16 @@ def test_disturbances_show_what_acts_and_change_only_what_was_given(windy: Serve
         give(label, value)
     fly(8)
     assert shown() == start | given
-    roll, speed, deadline = (session.limits[0], *[page._bounds[i] for i in (2, 3)])
+    roll = session.limits[0]
     shown_bounds = {float(values[-1]) for values in page._plots[1].data[5:]}
     assert shown_bounds == {roll.lower, roll.upper} == {-25.0, 25.0}
-    assert ([bound.value for bound in speed], [bound.value for bound in deadline]) == ([0.0, 838.0], [50.0])
+    speed, deadline = page._bounds[2:4]
+    assert [bound.value for bound in speed] == [0.0, 838.0]
+    assert [bound.value for bound in deadline] == [50.0]
     now = session.disturbances
-    assert (now.wind, now.mass_factor, now.lag) == ((4.0, -2.0, 0.5), 1.1, (0.015, 0.03))  # the air still rises
+    assert now.wind == (4.0, -2.0, 0.5)  # the air still rises
+    assert now.mass_factor == 1.1
+    assert now.lag == (0.015, 0.03)
     assert now.loss == pytest.approx([0.19, 0.0, 0.0, 0.0])
     give("Rotor lag up, down [ms]", (15.0, 0.0))  # refused: the rotors have inertia
     give("Rotor 1 loss", 0.0)  # it lacks .1 by the scenario
@@ -446,23 +474,40 @@ def test_disturbances_show_what_acts_and_change_only_what_was_given(windy: Serve
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright here: pip install playwright")
-    result = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if result is None:
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
         pytest.skip("no Chromium here: install the package 'chromium' to open the page in a browser")
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=result, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
         yield browser
         browser.close()
 
 
-@pytest.fixture(scope="module")
-def tab(browser: Any, served: Served) -> Iterator[Any]:
-    tab = browser.new_page(viewport={"width": 760, "height": 360})
+def opened(place: Any, served: Served, **options: Any) -> Any:
+    """Open the page of a session in a browser, or in a context of one, and wait until it flies."""
+    tab = place.new_page(**options)
     tab.set_default_timeout(1e3 * PATIENCE)
-    clock.sleep(0.3)
-    assert served.session.k == 0  # nobody looks
     tab.goto(served.page.address)
     tab.get_by_text("real-time factor").wait_for()
+    return tab
+
+
+def inputs_of(tab: Any, label: str) -> Any:
+    """The fields beside a label."""
+    return tab.locator("label", has_text=label).locator("xpath=ancestor::div[.//input][1]").locator("input")
+
+
+def slider_of(tab: Any, label: str) -> Any:
+    """The slider beside a label."""
+    row = tab.locator("label", has_text=label).locator("xpath=ancestor::div[.//*[@role='slider']][1]")
+    return row.get_by_role("slider")
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, served: Served) -> Iterator[Any]:
+    clock.sleep(0.3)
+    assert served.session.k == 0  # nobody looks
+    tab = opened(browser, served, viewport={"width": 760, "height": 360})
     yield tab
     tab.close()
 
@@ -481,8 +526,8 @@ def test_the_address_alone_opens_the_page(served: Served) -> None:
 
 def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
     box = tab.locator("canvas").first.bounding_box()
-    x, y = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
-
+    x = box["x"] + box["width"] / 2.0
+    y = box["y"] + box["height"] / 2.0
     tab.get_by_text("Drag the drone").wait_for()
     limit = clock.monotonic() + PATIENCE
     while not served.is_pushed():  # the page has to see the mouse above the vehicle before its button goes down
@@ -530,8 +575,7 @@ def test_sticks_steer_beyond_their_dead_zone_and_stop_when_they_are_let_go(tab: 
 
     tab.evaluate(STICKS)
     tab.evaluate("axes = [0.1, -0.14, 0, 0.1]")
-    k = served.session.k
-    served.wait(lambda: served.session.k > k + 10)
+    served.wait_for_periods(10)
     assert steered() == [0.0, 0.0, 0.0], "within the dead zone"
     tab.evaluate("axes = [-1, -0.6, 0, 1]")
     served.wait(lambda: steered() == [1.0, 2.0, -2.0])
@@ -542,19 +586,18 @@ def test_sticks_steer_beyond_their_dead_zone_and_stop_when_they_are_let_go(tab: 
 
 
 def test_a_slider_turns(tab: Any, served: Served) -> None:
-    row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
-    row.get_by_role("slider").focus()
+    slider_of(tab, "Mass factor").focus()
     tab.keyboard.press("ArrowRight")
     served.wait(lambda: any(event.factor == 1.01 for event in served.events("mass")))
 
 
 def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab: Any, served: Served) -> None:
     tab.get_by_role("tab", name="Controller").click()
-    field = tab.locator("label", has_text="N [periods]").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    field = inputs_of(tab, "N [periods]")
     field.fill("12")
     field.press("Enter")
     served.wait(lambda: served.session.flights[0].loop.controller.horizon == 12)
-    roll = tab.locator("label", has_text="roll [deg]").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    roll = inputs_of(tab, "roll [deg]")
     roll.last.fill("-1")  # [-5, -1]
     roll.last.press("Enter")
     tab.get_by_text("a range that contains 0, as in hover").first.wait_for()
@@ -595,62 +638,39 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     k = served.session.k
     tab.get_by_role("button", name="Reset", exact=True).click()
     served.wait(lambda: served.session.k < k)
-    field = tab.locator("label", has_text="N [periods]").locator("xpath=ancestor::div[.//input][1]").locator("input")
-    served.wait(lambda: field.input_value() == "10")
+    served.wait(lambda: inputs_of(tab, "N [periods]").input_value() == "10")
     tab.get_by_role("tab", name="Disturb").click()
     tab.get_by_role("button", name="Break a rotor").wait_for()
-    row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
-    served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
+    served.wait(lambda: slider_of(tab, "Mass factor").get_attribute("aria-valuenow") == "1")
     assert served.session.flights[0].loop.controller.horizon == 10
 
 
 def test_a_page_beside_other_cookies_flies_and_one_without_ours_says_why(browser: Any, windy: Served) -> None:
-    address = urlsplit(windy.page.address)
-    thread = threading.Thread(target=windy.pace.drive, args=(windy.session, windy.page))
-    thread.start()
-    try:
-        with browser.new_context() as context:
-            for name, value in (("prefs", '{"theme":"dark"}'), ("who", "hello world"), ("sel", "[1,2]")):
-                context.add_cookies([{"name": name, "value": value, "domain": address.hostname, "path": "/"}])
-            tab = context.new_page()
-            tab.set_default_timeout(1e3 * PATIENCE)
-            tab.goto(windy.page.address)
-            tab.get_by_text("real-time factor").wait_for()
-            context.clear_cookies()  # as of a browser that keeps none, or a session that has started anew
-            tab.get_by_text("Open the whole address that quadsim live printed").wait_for()
-    finally:
-        windy.pace.stop()
-        thread.join()
+    domain = urlsplit(windy.page.address).hostname
+    with windy.driven(), browser.new_context() as context:
+        for name, value in (("prefs", '{"theme":"dark"}'), ("who", "hello world"), ("sel", "[1,2]")):
+            context.add_cookies([{"name": name, "value": value, "domain": domain, "path": "/"}])
+        tab = opened(context, windy)
+        context.clear_cookies()  # as of a browser that keeps none, or a session that has started anew
+        tab.get_by_text("Open the whole address that quadsim live printed").wait_for()
 
 
 def test_one_component_that_is_typed_leaves_the_other(browser: Any, windy: Served) -> None:
-    thread = threading.Thread(target=windy.pace.drive, args=(windy.session, windy.page))
-    thread.start()
-    try:
-        tab = browser.new_page(viewport={"width": 760, "height": 800})
-        tab.set_default_timeout(1e3 * PATIENCE)
-        tab.goto(windy.page.address)
-        tab.get_by_text("real-time factor").wait_for()
-        row = tab.locator("label", has_text="Wind x, y").locator("xpath=ancestor::div[.//input][1]").locator("input")
-        assert [row.nth(i).input_value() for i in range(2)] == ["4", "0"]
-        row.nth(1).fill("-3")
-        row.nth(1).press("Enter")
+    with windy.driven():
+        tab = opened(browser, windy, viewport={"width": 760, "height": 800})
+        wind = inputs_of(tab, "Wind x, y")
+        assert [wind.nth(i).input_value() for i in range(2)] == ["4", "0"]
+        wind.nth(1).fill("-3")
+        wind.nth(1).press("Enter")
         windy.wait(lambda: windy.session.disturbances.wind == (4.0, -3.0, 0.5))
         assert windy.session.disturbances.lag == (0.015, 0.025)
         tab.close()
-    finally:
-        windy.pace.stop()
-        thread.join()
 
 
 @pytest.fixture(scope="module")
 def phone(browser: Any, served: Served) -> Iterator[Any]:
     context = browser.new_context(viewport={"width": 390, "height": 600}, has_touch=True, is_mobile=True)
-    phone = context.new_page()
-    phone.set_default_timeout(1e3 * PATIENCE)
-    phone.goto(served.page.address)
-    phone.get_by_text("real-time factor").wait_for()
-    yield phone
+    yield opened(context, served)
     context.close()
 
 
@@ -687,7 +707,8 @@ def test_a_finger_pulls_and_taps_waypoints(served: Served, phone: Any) -> None:
         at = [{"x": x, "y": y} for x, y in points]
         fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
 
-    while (notices := phone.locator(".mantine-Notification-closeButton")).count():
+    notices = phone.locator(".mantine-Notification-closeButton")
+    while notices.count():
         notices.first.click()  # they lie over the scene
         phone.wait_for_timeout(300)
     limit = clock.monotonic() + PATIENCE
@@ -705,7 +726,8 @@ def test_a_finger_pulls_and_taps_waypoints(served: Served, phone: Any) -> None:
 
 
 def test_a_closed_page_ends_its_push(served: Served, phone: Any) -> None:
-    if (take := phone.get_by_role("button", name="Take the controls")).is_visible():
+    take = phone.get_by_role("button", name="Take the controls")
+    if take.is_visible():
         take.click()
         take.wait_for(state="hidden")
     served.session.submit({"type": "pull", "to": [0.1, 0.0, 1.0]}, subject="pull")

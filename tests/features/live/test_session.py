@@ -224,7 +224,8 @@ class Clock:
     """Time that passes when it is waited for, and some more."""
 
     def __init__(self, extra: float) -> None:
-        self.now, self.extra = 0.0, extra
+        self.now = 0.0
+        self.extra = extra
 
     def __call__(self) -> float:
         self.now += self.extra
@@ -245,7 +246,8 @@ class Nobody:
 
 
 def test_a_slow_machine_flies_every_period_and_reports_its_speed(session: Session) -> None:
-    pace, view = Pace(Clock(LATE)), Nobody()
+    pace = Pace(Clock(LATE))
+    view = Nobody()
     frames: list[int] = []
     pace.drive(session, view, until=lambda frame: frames.append(frame.k) or frame.k == 9)  # type: ignore[func-returns-value]
     assert frames == [*range(10)]
@@ -269,7 +271,9 @@ def test_the_script_on_the_page_is_saved_as_a_run_that_flies_to_the_same_bytes(
 ) -> None:
     page = (Path(__file__).resolve().parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    script, saved, again = tmp_path / "script.toml", tmp_path / "saved", tmp_path / "again"
+    script = tmp_path / "script.toml"
+    saved = tmp_path / "saved"
+    again = tmp_path / "again"
     script.write_text(text, encoding="utf-8")
     assert read_script(script).inputs
     assert main(["live", "robust", "--script", str(script), "--out", str(saved)]) == EXIT_DONE
@@ -307,7 +311,8 @@ def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A wind cannot push a vehicle whose file states no drag; the session goes on."""
-    script, out = tmp_path / "script.toml", tmp_path / "run"
+    script = tmp_path / "script.toml"
+    out = tmp_path / "run"
     wind = "{ at = 0.12, type = 'wind', velocity = [1.0, 0.0, 0.0] }"
     push = "{ at = 0.2, type = 'push', duration = 0.3, force = [0.0, 15.0, 0.0] }"
     script.write_text(f"duration = 1.0\ninputs = [{push}, {wind}]", encoding="utf-8")
@@ -322,7 +327,9 @@ def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
 def test_a_finished_run_is_flown_on_unless_check_refuses_it_and_none_of_its_code_is_imported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    law, run, script = tmp_path / "law_of_run.py", tmp_path / "run", tmp_path / "script.toml"
+    law = tmp_path / "law_of_run.py"
+    run = tmp_path / "run"
+    script = tmp_path / "script.toml"
     law.write_text("import numpy as np\ndef held(now, state, reference):\n    return np.full(4, 192.8)\n")
     (tmp_path / "mine.toml").write_text(
         'base = "hover"\nname = "mine"\nduration = 0.2\nconstraints = []\ncontroller = "law_of_run:held"\n'

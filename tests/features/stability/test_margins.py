@@ -134,7 +134,9 @@ def test_a_law_of_ones_own_has_the_margin_of_its_gain(hummingbird: Scenario) -> 
     law = functools.partial(scaled_laws.ScaledGain, factor=3.0)
     found = quadsim.stability(hummingbird, controller=law, over=["thrust"], progress=False).loops[0]
     built = scaled_laws.ScaledGain(Assembly(hummingbird).vehicle, hummingbird.control_period, 1, factor=3.0)
-    A, B, K = built.model.A, built.model.B, built.gain
+    A = built.model.A
+    B = built.model.B
+    K = built.gain
 
     def radius(thrust: float) -> float:
         return float(np.abs(np.linalg.eigvals(A - math.sqrt(thrust) * B @ K)).max())
@@ -176,7 +178,7 @@ def test_a_law_that_raises_is_said_and_has_no_margins(hummingbird: Scenario) -> 
     found = quadsim.stability(hummingbird, controller=scaled_laws.RaisesLater, over=["delay"], progress=False)
     growth = found.loops[0].growth
     assert growth.verdict == "unstable"
-    assert growth.ended == "at t = 1.000 s: the controller raised RuntimeError: no answer for this"
+    assert growth.ended.endswith("RuntimeError: no answer for this")
     assert found.loops[0].margins == {}
     assert growth.ended in found.text()
 

@@ -32,19 +32,26 @@ def fly(
     scale: float = 1.0,
 ) -> list[tuple[float, Array, Array]]:
     """A body under commands that shake it, with exact integration; instants, attitudes and velocities measured."""
-    J, g, hover = np.array(vehicle.inertia), np.array([0.0, 0.0, vehicle.gravity]), vehicle.hover_speed
+    J = np.array(vehicle.inertia)
+    g = np.array([0.0, 0.0, vehicle.gravity])
+    hover = vehicle.hover_speed
     spin = (vehicle.rotor_inertia or 0.0) * np.array(vehicle.rotor_spins)
     x = np.concatenate([np.eye(3).ravel(), [2.0, -1.0, 0.5], [0.1, -0.2, 0.3], np.full(4, hover)])
     shake = np.array([[1, -1, 1, -1], [1, 0, -1, 0], [0, 1, 0, -1]]) * 0.03 * hover
-    seen, speeds = [], np.full(4, hover)
+    seen = []
+    speeds = np.full(4, hover)
     for k in range(periods):
-        time, R, v = k * PERIOD, x[:9].reshape(3, 3), x[9:12]
+        time = k * PERIOD
+        R = x[:9].reshape(3, 3)
+        v = x[9:12]
         observer.update(time, v, R, x[12:15], speeds)
         seen.append((time, R.copy(), v.copy()))
         speeds = hover + shake.T @ np.sin([3.0 * time, 5.0 * time, 4.0 * time + 1.0])
 
         def slope(t: float, x: Array, speeds: Array = speeds) -> Array:
-            R, v, Omega = x[:9].reshape(3, 3), x[9:12], x[12:15]
+            R = x[:9].reshape(3, 3)
+            v = x[9:12]
+            Omega = x[12:15]
             rotors = x[15:] if lag else speeds
             thrust, *torque = scale * vehicle.allocation @ rotors**2
             dv = thrust / vehicle.mass * R[:, 2] - g + force(t, R, v)
@@ -60,7 +67,8 @@ def fly(
 
 @pytest.mark.parametrize("lag", [0.0, 0.03])
 def test_a_force_that_changes_steadily_is_foreseen_without_lag(vehicle: Vehicle, lag: float) -> None:
-    start, change = np.array([0.5, -0.3, 0.2]), np.array([1.0, 2.0, -0.5])
+    start = np.array([0.5, -0.3, 0.2])
+    change = np.array([1.0, 2.0, -0.5])
     angular = np.array([0.0, 0.0, 0.0])
     observer = RampObserver(RampSettings(rotor_lag=lag), vehicle, PERIOD)
     observer.reset(np.full(4, vehicle.hover_speed))
@@ -72,8 +80,10 @@ def test_a_force_that_changes_steadily_is_foreseen_without_lag(vehicle: Vehicle,
 
 
 def test_torque_that_spins_the_rotors_up_is_no_disturbance(vehicle: Vehicle) -> None:
-    lag, heavy = 0.03, replace(vehicle, rotor_inertia=0.005 * vehicle.inertia[2])
-    settings, angular = RampSettings(rotor_lag=lag), np.zeros(3)
+    lag = 0.03
+    heavy = replace(vehicle, rotor_inertia=0.005 * vehicle.inertia[2])
+    settings = RampSettings(rotor_lag=lag)
+    angular = np.zeros(3)
     result = []
     for modelled in (heavy, vehicle):
         observer = RampObserver(settings, modelled, PERIOD)
@@ -85,7 +95,9 @@ def test_torque_that_spins_the_rotors_up_is_no_disturbance(vehicle: Vehicle) -> 
 
 
 def test_rotors_that_lag_after_a_large_step_are_no_disturbance(vehicle: Vehicle) -> None:
-    lag, hover, commanded = 0.03, vehicle.hover_speed, 0.7 * vehicle.hover_speed
+    lag = 0.03
+    hover = vehicle.hover_speed
+    commanded = 0.7 * vehicle.hover_speed
     observer = RampObserver(RampSettings(rotor_lag=lag), vehicle, PERIOD)
     observer.reset(np.full(4, hover))
 
@@ -110,7 +122,8 @@ def test_a_constant_torque_is_estimated(vehicle: Vehicle) -> None:
 
 
 def test_known_drag_is_no_disturbance_and_unknown_drag_is_fitted(vehicle: Vehicle) -> None:
-    linear, quadratic = np.array([0.6, 0.4, 0.2]), np.array([0.05, 0.1, 0.0])
+    linear = np.array([0.6, 0.4, 0.2])
+    quadratic = np.array([0.05, 0.1, 0.0])
 
     def drag(t: float, R: Array, v: Array) -> Array:
         v_b = R.T @ v
@@ -130,7 +143,8 @@ def test_known_drag_is_no_disturbance_and_unknown_drag_is_fitted(vehicle: Vehicl
 
 def test_estimates_stay_within_their_limits_and_gaps_teach_nothing(vehicle: Vehicle) -> None:
     observer = RampObserver(RampSettings(largest_force=0.5, largest_torque=0.1), vehicle, PERIOD)
-    hover, rest = np.full(4, vehicle.hover_speed), np.zeros(3)
+    hover = np.full(4, vehicle.hover_speed)
+    rest = np.zeros(3)
     for k in range(20):
         observer.update(k * PERIOD, np.array([k * PERIOD * 5.0, 0.0, 0.0]), np.eye(3), rest, hover)
     np.testing.assert_allclose(observer.foreseen(0.3)[0], [0.5, 0.0, 0.0], atol=1e-9)
@@ -152,7 +166,9 @@ def straight(
     observer: RampObserver, vehicle: Vehicle, tilt: float, thrust: float, scale: Callable[[float], float], force: Array
 ) -> None:
     """70 periods at a constant tilt [deg] and commanded thrust over weight, whose scale has this integral over time."""
-    g, R, rest = vehicle.gravity, tilted(tilt), np.zeros(3)
+    g = vehicle.gravity
+    R = tilted(tilt)
+    rest = np.zeros(3)
     rotors = np.full(4, vehicle.hover_speed * np.sqrt(thrust))
     command = thrust * vehicle.mass * g if observer.numbers.targets else rotors
     observer.reset(command)
@@ -185,7 +201,8 @@ def test_vertical_misfit_is_the_thrusts_and_horizontal_is_a_force(
 
 
 def test_a_force_is_never_taken_for_thrust(vehicle: Vehicle) -> None:
-    observer, R = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=0.02), tilted(45.0)
+    observer = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=0.02)
+    R = tilted(45.0)
     weight = vehicle.mass * vehicle.gravity
     observer.reset(weight)
     for k in range(20):
@@ -213,7 +230,9 @@ def test_rotors_that_all_give_less_are_found_while_they_turn_the_body(vehicle: V
 
 def test_thrust_that_lags_after_a_large_step_is_no_disturbance(vehicle: Vehicle) -> None:
     """At half the weight from hover, v' = -0.5 g (1 - exp(-t / lag))."""
-    lag, g, weight = 0.03, vehicle.gravity, vehicle.mass * vehicle.gravity
+    lag = 0.03
+    g = vehicle.gravity
+    weight = vehicle.mass * vehicle.gravity
     for settings in (SCALED, RampSettings()):
         observer = RampObserver(settings, vehicle, PERIOD, thrust_lag=lag)
         observer.reset(weight)
@@ -225,7 +244,8 @@ def test_thrust_that_lags_after_a_large_step_is_no_disturbance(vehicle: Vehicle)
 
 
 def test_the_scale_holds_in_free_fall_and_upside_down(vehicle: Vehicle) -> None:
-    observer, weight = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=0.0), vehicle.mass * vehicle.gravity
+    observer = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=0.0)
+    weight = vehicle.mass * vehicle.gravity
     straight(observer, vehicle, 0.0, 1.2, lambda t: 0.8 * t - 0.001 * t**2, np.zeros(3))
     before = observer.thrust_scale
     for k, (tilt, thrust) in enumerate([(0.0, 0.1)] * 20 + [(180.0, 1.0)] * 20):
@@ -243,18 +263,28 @@ def test_the_scale_stays_within_its_limits(vehicle: Vehicle, scale: float, limit
 
 def test_scale_and_force_do_not_drift_in_a_long_hover_with_noise(vehicle: Vehicle) -> None:
     """A minute of the loop that they close, with wind and 80 % of the thrust, and noise of 2 cm/s."""
-    rng, lag, m, g = np.random.default_rng(2), 0.03, vehicle.mass, vehicle.gravity
-    observer, wind = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=lag), np.array([1.5, -0.5, 0.0])
-    velocity, thrust, scales, forces = np.zeros(3), m * g, [], []
-    R, command = np.eye(3), m * g
+    rng = np.random.default_rng(2)
+    lag = 0.03
+    m = vehicle.mass
+    g = vehicle.gravity
+    observer = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=lag)
+    wind = np.array([1.5, -0.5, 0.0])
+    velocity = np.zeros(3)
+    thrust = m * g
+    scales = []
+    forces = []
+    R = np.eye(3)
+    command = m * g
     observer.reset(m * g)
     left = np.exp(-PERIOD / lag)
     for k in range(3000):
         seen = velocity + rng.normal(scale=0.02, size=3)
         observer.update(k * PERIOD, seen, R, np.zeros(3), command)
-        force, kappa = observer.foreseen(0.5 * PERIOD)[0], observer.thrust_scale
+        force = observer.foreseen(0.5 * PERIOD)[0]
+        kappa = observer.thrust_scale
         demanded = np.array([0.0, 0.0, g]) - seen - force
-        axis, before = demanded / np.linalg.norm(demanded), R[:, 2]
+        axis = demanded / np.linalg.norm(demanded)
+        before = R[:, 2]
         across = np.cross([0.0, 1.0, 0.0], axis) / np.linalg.norm(np.cross([0.0, 1.0, 0.0], axis))
         R = np.stack([across, np.cross(axis, across), axis], axis=1)
         command = float(m * np.linalg.norm(demanded) / kappa)
@@ -277,7 +307,8 @@ def test_with_a_scale_drag_is_fitted_along_body_x_and_y(vehicle: Vehicle) -> Non
         fly(vehicle, observer, lambda t, R, v: -R @ (linear * (R.T @ v)), np.zeros(3), periods)
         return observer.drag
 
-    upright, scaled = fitted(RampSettings(), 20), fitted(SCALED, 20)
+    upright = fitted(RampSettings(), 20)
+    scaled = fitted(SCALED, 20)
     np.testing.assert_allclose(scaled[:2], upright[:2], rtol=0.02)
     assert upright[2] > 0.0 == scaled[2]
     np.testing.assert_array_equal(fitted(SCALED, 26), fitted(SCALED, 50))
@@ -288,7 +319,8 @@ def test_an_observer_takes_over_only_what_it_estimates_itself(vehicle: Vehicle) 
     straight(scaled, vehicle, 0.0, 1.3, lambda t: 0.8 * t, np.array([0.5, 0.0, 0.0]))
     turning = RampObserver(RampSettings(), vehicle, PERIOD)
     fly(vehicle, turning, lambda t, R, v: np.zeros(3), np.array([0.2, 0.0, 0.0]), 40)
-    same, other = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=0.03), RampObserver(RampSettings(), vehicle, PERIOD)
+    same = RampObserver(SCALED, vehicle, PERIOD, thrust_lag=0.03)
+    other = RampObserver(RampSettings(), vehicle, PERIOD)
     same.adopt(scaled)
     assert same.thrust_scale == scaled.thrust_scale
     other.adopt(scaled)
@@ -307,7 +339,8 @@ def test_the_core_has_the_numbers_of_the_equations(
     vehicle: Vehicle, scaled: bool, rotor_lag: float | None, thrust_lag: float | None, moment: bool
 ) -> None:
     """Whatever the motion: at every tenth update there was a gap, and some are upside down or beyond the limits."""
-    Ixx, products = vehicle.inertia[0], 0.05 * vehicle.inertia[0] * np.array([1.0, -2.0, 3.0])
+    Ixx = vehicle.inertia[0]
+    products = 0.05 * vehicle.inertia[0] * np.array([1.0, -2.0, 3.0])
     vehicle = replace(
         vehicle,
         **{"inertia": (Ixx, 1.1 * Ixx, 1.5 * Ixx), "products_of_inertia": tuple(products.tolist())},
@@ -316,17 +349,21 @@ def test_the_core_has_the_numbers_of_the_equations(
         inflow=2e-3,
     )
     settings = RampSettings(thrust_scale=scaled, rotor_lag=rotor_lag, largest_force=5.0)
-    rng, weight = np.random.default_rng(5), vehicle.mass * vehicle.gravity
+    rng = np.random.default_rng(5)
+    weight = vehicle.mass * vehicle.gravity
     hover = vehicle.hover_speeds if thrust_lag is None else np.array([weight])
     drags = {"drag": np.array([0.3, 0.2, 0.1]), "quadratic_drag": np.array([0.02, 0.0, 0.05])}
     others = {"moment": moment, "thrust_lag": thrust_lag}
     observer = RampObserver(settings, vehicle, PERIOD, **drags, **others)  # type: ignore[arg-type]
     check = NumpyRamp(settings, vehicle, PERIOD, **drags, **others, acting=hover)  # type: ignore[arg-type]
-    time, limited, fitted = 0.0, 0, 0
+    time = 0.0
+    limited = 0
+    fitted = 0
     for k in range(100):
         follows = k % 10 != 9
         time += PERIOD if follows else 3.0 * PERIOD
-        v, Omega = rng.normal(size=3) * 0.1 + [1.0, 2.0, -0.5], rng.normal(size=3) * 0.5
+        v = rng.normal(size=3) * 0.1 + [1.0, 2.0, -0.5]
+        Omega = rng.normal(size=3) * 0.5
         R = (Rotation.from_euler("X", 180.0 * (k % 20 == 7), degrees=True) * Rotation.from_rotvec(Omega)).as_matrix()
         command = hover * rng.uniform(0.8, 1.2, size=hover.shape)
         observer.update(time, v, R, Omega, command)

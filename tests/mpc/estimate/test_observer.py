@@ -53,7 +53,8 @@ class Observed:
 
 def answer(vehicle: Vehicle, settings: ObserverSettings, pushed: Array, periods: int) -> Array:
     """Estimates (periods, 6) for a level vehicle that a constant disturbance (6,) moves as it would."""
-    observer, estimates = Observed(vehicle, settings), np.empty((periods, 6))
+    observer = Observed(vehicle, settings)
+    estimates = np.empty((periods, 6))
     for k in range(periods):
         observer.update(PERIOD * (pushed - observer.estimate))
         estimates[k] = observer.estimate
@@ -64,8 +65,12 @@ def answer(vehicle: Vehicle, settings: ObserverSettings, pushed: Array, periods:
 
 
 def test_gains_are_those_the_filters_covariance_recursion_converges_to() -> None:
-    noise, walk, change = 0.07, 0.05, 0.2
-    A, C, P = np.array([[1.0, PERIOD], [0.0, 1.0]]), np.array([1.0, 0.0]), np.eye(2)
+    noise = 0.07
+    walk = 0.05
+    change = 0.2
+    A = np.array([[1.0, PERIOD], [0.0, 1.0]])
+    C = np.array([1.0, 0.0])
+    P = np.eye(2)
     K = np.zeros(2)
     for _ in range(5000):
         P = A @ P @ A.T + np.diag([walk**2, change**2])
@@ -121,13 +126,16 @@ def test_noise_of_the_stated_size_moves_the_estimate_by_little(vehicle: Vehicle)
     """d(k+1) = d(k) + g (n(k+1) - n(k) - tau d(k)): with p = 1 - g tau its variance is 2 g^2 sigma^2 / (1 + p)."""
     rng = np.random.default_rng(0)
     settings = ObserverSettings()
-    observer, noise = Observed(vehicle, settings), settings.velocity_noise
+    observer = Observed(vehicle, settings)
+    noise = settings.velocity_noise
     assert settings.rate_noise == noise
-    before, estimates = np.zeros(6), np.empty((1200, 6))
+    before = np.zeros(6)
+    estimates = np.empty((1200, 6))
     for k in range(len(estimates)):
         measured = noise * rng.normal(size=6)
         observer.update(measured - before - PERIOD * observer.estimate)
-        before, estimates[k] = measured, observer.estimate
+        before = measured
+        estimates[k] = observer.estimate
     doubled = math.sqrt(2.0)
     gains = [
         observer_gain(PERIOD, noise=doubled * noise, walk=0.05, change=change)[1]
@@ -143,7 +151,8 @@ def test_frames_are_those_of_the_world_the_thrust_and_the_body_at_any_attitude(
     vehicle: Vehicle, component: int
 ) -> None:
     """What a wrong mass does is no force sideways, however the vehicle is tilted, and torques are about body axes."""
-    observer, surprise = Observed(vehicle), np.zeros(6)
+    observer = Observed(vehicle)
+    surprise = np.zeros(6)
     surprise[component] = 0.01
     observer.update(surprise, make_state(euler=(0.4, -0.5, 2.0)))
     assert observer.estimate[component] > 0.0

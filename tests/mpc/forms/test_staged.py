@@ -51,7 +51,8 @@ class Changing:
         return self.form.assemble(now.query)
 
     def solve(self, now: Period) -> Solution:
-        backend, qp = Piqp(), self.qp(now)
+        backend = Piqp()
+        qp = self.qp(now)
         backend.setup(qp)
         return backend.solve(qp)
 
@@ -166,14 +167,17 @@ def test_rows_of_other_numbers_are_written_to_the_same_places() -> None:
     turned /= np.linalg.norm(turned, axis=2, keepdims=True)
     other = with_rows(turned)
     query = Query(0.1 * rng.normal(size=12), rng.normal(size=(7, 4)), problem.model.u_bar)
-    qp, expected = form.assemble(query, other), Staged(other).assemble(query)
+    qp = form.assemble(query, other)
+    expected = Staged(other).assemble(query)
     np.testing.assert_array_equal(qp.G.indices, form.qp.G.indices)
     np.testing.assert_array_equal(qp.G.indptr, form.qp.G.indptr)
     assert not qp.G.data.all()
     for field in fields(QP):
-        value, wanted = getattr(qp, field.name), getattr(expected, field.name)
+        value = getattr(qp, field.name)
+        wanted = getattr(expected, field.name)
         if isinstance(value, csc_matrix):
-            value, wanted = value.toarray(), wanted.toarray()
+            value = value.toarray()
+            wanted = wanted.toarray()
         np.testing.assert_array_equal(value, wanted)
 
 
@@ -225,8 +229,10 @@ def test_bounds_at_infinity_are_none(soft: bool) -> None:
     problem = replace(problem, bounds=bounds)
     if soft:
         problem = softened(problem, [30.0, 30.0], [0.0, 0.0])
-    now, solver = changing_period(rng, problem), Changing(problem)
-    peer, solution = ocp_peer.optimum(problem, now), solver.solve(now)
+    now = changing_period(rng, problem)
+    solver = Changing(problem)
+    peer = ocp_peer.optimum(problem, now)
+    solution = solver.solve(now)
     assert peer.solution.status == solution.status == SOLVED
     np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
 
@@ -263,10 +269,12 @@ def along_flight(flight: Flight, vehicle: Vehicle, problem: Problem, stride: int
 def test_slack_is_zero_where_hard_bounds_cost_less_than_its_price(constrained_flight: Flight, vehicle: Vehicle) -> None:
     problem = lagging(paper_problem(), vehicle)
     price = 3e3
-    hard, soft = Changing(problem), Changing(softened(problem, [price, price], [1e4, 1e4]))
+    hard = Changing(problem)
+    soft = Changing(softened(problem, [price, price], [1e4, 1e4]))
     pressing = dear = 0
     for now in along_flight(constrained_flight, vehicle, problem, stride=40):
-        strict, lenient = hard.solve(now), soft.solve(now)
+        strict = hard.solve(now)
+        lenient = soft.solve(now)
         assert lenient.status == SOLVED
         multiplier = np.abs(hard.form.multipliers(strict)[:, :2]).max()  # of the output bounds
         if strict.status == SOLVED and multiplier < price:
@@ -286,18 +294,21 @@ def test_slack_is_the_smallest_where_hard_bounds_are_infeasible() -> None:
     assert bounds is not None
     tilted = np.zeros(12)
     tilted[[6, 7, 9]] = np.radians([12.0, 20.0, 15.0])
-    desired, u_bar = problem.desired(np.zeros((50, 4))), problem.model.u_bar
+    desired = problem.desired(np.zeros((50, 4)))
+    u_bar = problem.model.u_bar
     now = ocp_peer.period(problem, tilted, desired, u_bar)
     assert Changing(problem).solve(now).status != SOLVED
     lenient = softened(problem, [1e6, 1e6], [0.0, 0.0])
     solver = Changing(lenient)
     solution = solver.solve(now)
     assert solution.status == SOLVED
-    plan, slacks = solver.plan(solution), solver.slacks(solution)
+    plan = solver.plan(solution)
+    slacks = solver.slacks(solution)
     np.testing.assert_allclose(slacks, ocp_peer.violation(bounds.constraints[0], now, plan), atol=1e-7)
     # The same rows, probed, with slacks to be minimised alone.
     qp = ocp_peer.dense_qp(lenient, now)
-    above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
+    above = np.isfinite(qp.h_u)
+    below = np.isfinite(qp.h_l)
     least = scipy.optimize.linprog(
         np.concatenate([np.zeros(200), np.ones(100)]),
         A_ub=np.vstack([qp.G[above], -qp.G[below]]),

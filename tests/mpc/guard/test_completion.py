@@ -51,7 +51,9 @@ def process_noise() -> Array:
 
 def filtered(measured: Array, speeds: Array, trim: Trim) -> Array:
     """States (K, 12) of a Kalman filter with all measured channels (K, 12) at once, under speeds (K, 4) before each."""
-    state, P, R = np.zeros(12), np.diag(UNKNOWN**2), np.diag(NOISE**2)
+    state = np.zeros(12)
+    P = np.diag(UNKNOWN**2)
+    R = np.diag(NOISE**2)
     states = []
     for row, command in zip(measured, speeds, strict=True):
         T = turn(float(state[INDEX["yaw"]]))
@@ -112,7 +114,8 @@ def test_implausible_numbers_are_missing_ones(value: float) -> None:
 
 def test_available_channels_correct_missing_ones() -> None:
     states, speeds = moving(20, acceleration=1.0)
-    x, vx = INDEX["x"], INDEX["vx"]
+    x = INDEX["x"]
+    vx = INDEX["vx"]
     blind = complete(states, speeds, (x, vx))
     corrected = complete(states, speeds, (vx,))
     assert abs(blind[-1] - states[-1])[vx] == pytest.approx(1.0)  # 1 m/s^2 for 1 s
@@ -152,7 +155,8 @@ def test_frozen_numbers_are_missing_ones(group: Sequence[int]) -> None:
 
 
 def test_a_vehicle_at_rest_or_on_the_ground_is_not_frozen() -> None:
-    completion, rest = Completion(), np.zeros(12)
+    completion = Completion()
+    rest = np.zeros(12)
     for _ in range(3):
         completion(rest, model().u_bar)
     assert not completion.unseen.any()
@@ -178,7 +182,8 @@ def test_channels_missing_for_long_are_recovered_from_the_rest() -> None:
 
 
 def test_nothing_measured_ever_stays_finite() -> None:
-    completion, rng = Completion(), np.random.default_rng(7)
+    completion = Completion()
+    rng = np.random.default_rng(7)
     for k in range(1000):
         seen = rng.normal(size=12) if k % 250 == 0 else np.zeros(3)
         known = completion(seen, rng.uniform(-1e5, 1e5, 4))

@@ -211,7 +211,8 @@ def test_an_impossible_command_in_force_is_replaced_by_its_own_last_one(acting: 
 def test_a_contract_goes_on_from_another(horizon: int) -> None:
     """With its plan, cut or extended by its last row, and the periods in fallback, and in hover, so far."""
     first = guard(Scripted(failing(range(1, 200))))
-    state, commands = np.zeros(12), []
+    state = np.zeros(12)
+    commands = []
     for k in range(150):
         if k in (5, 60):
             second = guard(Scripted(failing(range(200)), horizon=horizon))
@@ -299,7 +300,8 @@ def test_on_the_ground_rotors_stop_whatever_the_controller_answers(phase: Phase)
 def test_prediction_is_the_inner_controller_s_where_it_has_one() -> None:
     inner = Scripted()
     guarded = guard(inner)
-    states, plans = random_state(8)[None], np.tile(model().u_bar, (1, 30, 1))
+    states = random_state(8)[None]
+    plans = np.tile(model().u_bar, (1, 30, 1))
     expected = inner.predict(states, plans)
     np.testing.assert_array_equal(guarded.predict(states, plans), expected)
     inner.predict = lambda states, plans: np.zeros(3)  # type: ignore[method-assign]

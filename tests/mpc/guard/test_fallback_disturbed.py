@@ -16,7 +16,8 @@ from quadsim.state import INDEX
 def test_every_level_compensates_the_disturbance(yaw: float) -> None:
     guarded = guard(Pressed(failing(range(1, 200))))
     guarded.reset(pressed().speeds)
-    state, levels = at_rest(yaw), []
+    state = at_rest(yaw)
+    levels = []
     for _ in range(200):
         command = call(guarded, state)
         levels.append(command.fallback)
@@ -70,5 +71,6 @@ def test_a_controller_without_a_valid_trim_hovers_level(trim: Any) -> None:
 
 
 def test_its_own_predictions_turn_with_the_heading() -> None:
-    states, plans = np.array([at_rest(2.0), at_rest(-1.0)]), np.tile(pressed().speeds, (2, 30, 1))
+    states = np.array([at_rest(2.0), at_rest(-1.0)])
+    plans = np.tile(pressed().speeds, (2, 30, 1))
     np.testing.assert_allclose(guard(Pressed()).predict(states, plans), states[:, None].repeat(30, 1), atol=1e-9)

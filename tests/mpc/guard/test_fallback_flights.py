@@ -32,7 +32,10 @@ LEVEL = FallbackSettings(tilt=4.0)
 """Levels 2 and 3 keep within the paper's bound of 5 deg on tilt, which its controller must find held to go on."""
 
 
-START, FAULT, DURATION, LONGER = 10.0, 2.0, 6.0, 12.0
+START = 10.0
+FAULT = 2.0
+DURATION = 6.0
+LONGER = 12.0
 """The paper's 10 m step along x, tilt and rotors at their bounds, from its beginning; times [s]."""
 
 
@@ -41,7 +44,8 @@ class FaultySolver(QPSolver):
 
     def __init__(self, faults: dict[int, str | Exception]) -> None:
         super().__init__("piqp-multistage", problem())
-        self.faults, self.calls = faults, -1
+        self.faults = faults
+        self.calls = -1
 
     def solve(self, query: Query) -> Answer:
         self.calls += 1
@@ -65,7 +69,8 @@ def fly_paper(
     contact: bool = False,
     **options: Any,
 ) -> FlightLog:
-    first, periods = round(START / PERIOD), round(duration / PERIOD)
+    first = round(START / PERIOD)
+    periods = round(duration / PERIOD)
     reference = paper_reference(first + periods + 51)[first:].copy()
     if height is not None:
         reference[:, 2] = height
@@ -112,7 +117,8 @@ def distance(log: FlightLog, undisturbed: FlightLog) -> Array:
 
 def test_without_faults_the_flight_is_the_same_to_the_last_bit(vehicle: Vehicle, undisturbed: FlightLog) -> None:
     log = fly_paper(vehicle)
-    periods, rows = len(log.control.t), len(log.plant.t)
+    periods = len(log.control.t)
+    rows = len(log.plant.t)
     np.testing.assert_array_equal(log.control.speeds, undisturbed.control.speeds[:periods])
     np.testing.assert_array_equal(log.plant.state, undisturbed.plant.state[:rows])
     assert log.control.status == undisturbed.control.status[:periods]

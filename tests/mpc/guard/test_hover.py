@@ -40,7 +40,8 @@ TILTS = [INDEX["roll"], INDEX["pitch"]]
 
 def infinite_horizon(A: Array, pushed: Array) -> Array:
     """(4, 12) gain of the LQR, from the algebraic Riccati equation."""
-    Q, R = np.diag(ACCEPTABLE**-2.0), np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0)
+    Q = np.diag(ACCEPTABLE**-2.0)
+    R = np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0)
     P = scipy.linalg.solve_discrete_are(A, pushed, Q, R)
     return np.asarray(np.linalg.solve(R + pushed.T @ P @ pushed, pushed.T @ P @ A))
 
@@ -105,7 +106,8 @@ def test_the_gain_is_the_infinite_horizon_s() -> None:
     law = HoverGain.of_model(model())
     np.testing.assert_allclose(law.gain, infinite_horizon(model().A, model().B @ law.inverse), rtol=1e-6, atol=1e-9)
     weight = law.slope.T @ np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0) @ law.slope
-    A, B = model().A, model().B
+    A = model().A
+    B = model().B
     P = scipy.linalg.solve_discrete_are(A, B, np.diag(ACCEPTABLE**-2.0), weight)
     expected = np.linalg.solve(weight + B.T @ P @ B, B.T @ P @ A)
     np.testing.assert_allclose(law.inverse @ law.gain, expected, rtol=1e-6, atol=1e-7)
@@ -149,7 +151,8 @@ def test_a_kept_plan_is_corrected_in_the_heading_frame(yaw: float) -> None:
 
 @pytest.mark.parametrize("yaw", [0.5, math.pi / 2, math.pi, -2.0])
 def test_law_and_prediction_turn_with_the_heading(yaw: float) -> None:
-    T, state = turn(yaw), random_state(3)
+    T = turn(yaw)
+    state = random_state(3)
     speeds = model().u_bar + np.array([3.0, -2.0, 1.0, 0.5])
     state[INDEX["yaw"]] = 0.0
     ahead = np.zeros(12)
@@ -188,7 +191,8 @@ def test_the_plan_of_the_descent_sinks_and_levels() -> None:
 
 def test_the_plan_of_hover_alone_is_that_of_a_law_without_an_answer() -> None:
     """As the advice on an infeasible period asks for it."""
-    law, state = Scripted(), random_state(5, 0.05)
+    law = Scripted()
+    state = random_state(5, 0.05)
     contract = Guard(model(), bounds=bounds())
     plan = contract.hover(law, state, model().u_bar)
     assert not law.calls

@@ -29,7 +29,8 @@ def rotations(seed: int, count: int = 2) -> list[np.ndarray]:
 def test_the_error_function_is_a_distance_and_e_r_its_gradient(seed: int) -> None:
     """Psi >= 0, zero at R_d alone, symmetric; its change along R hat(eta) is e_R . eta; |e_R|^2 = Psi (2 - Psi)."""
     R, R_d = rotations(seed)
-    psi, e_R = psi_of(R, R_d), attitude_error(R, R_d)
+    psi = psi_of(R, R_d)
+    e_R = attitude_error(R, R_d)
     assert -1e-12 <= psi <= 2.0 + 1e-12
     assert psi_of(R_d, R) == pytest.approx(psi, abs=1e-12)
     assert psi_of(R, R) == pytest.approx(0.0, abs=1e-12)
@@ -80,7 +81,8 @@ def test_upside_down_rolls_over() -> None:
 @given(seed=SEEDS)
 def test_the_wanted_attitude_points_its_thrust_and_its_heading(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    force, yaw = rng.normal(size=3), rng.uniform(-3.0, 3.0)
+    force = rng.normal(size=3)
+    yaw = rng.uniform(-3.0, 3.0)
     force[2] = abs(force[2]) + 0.1
     R = attitude_for(force, yaw)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -97,7 +99,8 @@ def test_a_force_is_leant_no_further_than_allowed() -> None:
 
 
 def test_vee_undoes_hat_which_is_the_cross_product() -> None:
-    a, b = np.array([1.0, -2.0, 3.0]), np.array([0.3, 0.2, 0.1])
+    a = np.array([1.0, -2.0, 3.0])
+    b = np.array([0.3, 0.2, 0.1])
     np.testing.assert_allclose(hat(a) @ b, np.cross(a, b))
     np.testing.assert_allclose(vee(hat(a)), a)
 

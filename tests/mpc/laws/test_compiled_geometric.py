@@ -22,7 +22,8 @@ from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, Array
 from quadsim.vehicle import Vehicle
 
-PERIOD, LAGS = 0.02, (0.02, 0.035, 0.04, 0.1)
+PERIOD = 0.02
+LAGS = (0.02, 0.035, 0.04, 0.1)
 LAWS: dict[str, dict[str, Any]] = {
     "rotors": {"integral": True},
     "rotors fed forward": {"feedforward": True, "drag": (0.3, 0.2, 0.1), "moment": True},
@@ -79,8 +80,10 @@ def drawn(rng: np.random.Generator) -> tuple[Measured, Target, Integrals, tuple[
 
 @pytest.mark.parametrize("name", LAWS)
 def test_the_core_has_the_numbers_of_the_equations(heavy: Vehicle, name: str) -> None:
-    settings, rng = settings_of(name), np.random.default_rng(7)
-    law, check = GeometricController(heavy, PERIOD, settings), NumpyGeometric(heavy, PERIOD, settings)
+    settings = settings_of(name)
+    rng = np.random.default_rng(7)
+    law = GeometricController(heavy, PERIOD, settings)
+    check = NumpyGeometric(heavy, PERIOD, settings)
     for _ in range(60):
         motion, target, integrals, disturbance = drawn(rng)
         results = [
@@ -124,7 +127,8 @@ def check_target(target: Target, expected: Target, *, of_yaw: bool = True) -> No
 @pytest.mark.parametrize("quaternions", [True, False])
 def test_a_law_of_rates_is_its_parts_period_by_period(vehicle: Vehicle, quaternions: bool) -> None:
     """Observer, law, scale, bounds and integrals in one call; on the ground nothing is learnt or summed."""
-    weight, rng = vehicle.mass * vehicle.gravity, np.random.default_rng(11)
+    weight = vehicle.mass * vehicle.gravity
+    rng = np.random.default_rng(11)
     bounds = TargetBounds(thrust=(0.7 * weight, 1.3 * weight), body_rate=120.0)
     observing = RampSettings(thrust_scale=True)
     settings = Geometric(
@@ -132,7 +136,8 @@ def test_a_law_of_rates_is_its_parts_period_by_period(vehicle: Vehicle, quaterni
         disturbance=observing,
         target_bounds=bounds,
     )
-    law, check = GeometricController(vehicle, PERIOD, settings), NumpyGeometric(vehicle, PERIOD, settings)
+    law = GeometricController(vehicle, PERIOD, settings)
+    check = NumpyGeometric(vehicle, PERIOD, settings)
     hover = np.array([weight, 0.0, 0.0, 0.0])
     ramp = NumpyRamp(
         observing,
@@ -145,20 +150,27 @@ def test_a_law_of_rates_is_its_parts_period_by_period(vehicle: Vehicle, quaterni
         acting=hover[:1],
     )
     law.reset(hover)
-    actuators, integrals = bounds.actuators(vehicle), Integrals(translation=np.zeros(3), rotation=np.zeros(3))
-    operator, command, held = differentiator(settings.horizon, PERIOD, degree=4), hover, 0
+    actuators = bounds.actuators(vehicle)
+    integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
+    operator = differentiator(settings.horizon, PERIOD, degree=4)
+    command = hover
+    held = 0
     for k in range(60):
-        flying, state = k >= 5, rng.normal(size=12) * 0.02
+        flying = k >= 5
+        state = rng.normal(size=12) * 0.02
         reference = np.full((settings.horizon, 4), 0.001) * k
         attitude = euler_to_quaternion(state[list(EULER)]) if quaternions else None
         now = StepInputs(
             time=k * PERIOD, attitude=attitude, acting=command, phase=Phase.FLYING if flying else Phase.ARMED
         )
-        motion, target = motion_of(state, attitude), target_of(reference, operator)
-        disturbance, kappa = (np.zeros(3), np.zeros(3), np.zeros(3)), 1.0
+        motion = motion_of(state, attitude)
+        target = target_of(reference, operator)
+        disturbance = (np.zeros(3), np.zeros(3), np.zeros(3))
+        kappa = 1.0
         if flying:
             ramp.update(k > 5, motion.velocity, motion.attitude, motion.rates, command[:1])
-            disturbance, kappa = ramp.foreseen(0.5 * PERIOD), ramp.scale
+            disturbance = ramp.foreseen(0.5 * PERIOD)
+            kappa = ramp.scale
         else:
             ramp.acting = command[:1]
         demanded, desired = check.targets(motion, target, integrals, disturbance)

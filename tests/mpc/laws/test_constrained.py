@@ -21,7 +21,8 @@ class FaultySolver(QPSolver):
     def __init__(self, faults: dict[int, str], horizon: int = 50) -> None:
         self.problem = paper_problem("paper-constrained", f"controller.horizon={horizon}")
         super().__init__("piqp-multistage", self.problem)
-        self.faults, self.calls = faults, 0
+        self.faults = faults
+        self.calls = 0
 
     def solve(self, query: Query) -> Answer:
         answer = super().solve(query)
@@ -114,7 +115,8 @@ def test_slews_count_from_the_command_that_acts() -> None:
 
 def test_on_the_ground_the_plan_is_forgotten() -> None:
     solver = FaultySolver({1: "numerics"})
-    controller, reference = constrained_mpc(solver.problem, solver), paper_reference(51)[1:]
+    controller = constrained_mpc(solver.problem, solver)
+    reference = paper_reference(51)[1:]
     controller.step(StepInputs(), STATE, reference)
     controller.step(StepInputs(time=0.05, phase=Phase.LANDED), STATE, reference)
     with pytest.raises(PlanExhaustedError, match="plan"):
@@ -135,7 +137,8 @@ def test_the_heir_of_a_held_plan_holds_the_rest_of_it() -> None:
 
 
 def test_what_was_not_measured_is_no_infeasible_period() -> None:
-    controller, reference = constrained_mpc(paper_problem()), paper_reference(51)[1:]
+    controller = constrained_mpc(paper_problem())
+    reference = paper_reference(51)[1:]
     controller.step(StepInputs(), STATE, reference)
     assert controller.step(StepInputs(time=0.05), STATE * np.nan, reference).status == INVALID_DATA
     assert controller.infeasible_period is None

@@ -103,7 +103,8 @@ def thrown() -> Array:
     """A state (13,) of a vehicle that is tilted, moves and turns."""
     x = np.zeros(N_BODY)
     x[Q] = exponential((0.2, -0.3, 0.5))
-    x[V], x[W] = (0.5, -0.4, 0.2), (1.0, -2.0, 0.5)
+    x[V] = (0.5, -0.4, 0.2)
+    x[W] = (1.0, -2.0, 0.5)
     return x
 
 
@@ -115,7 +116,8 @@ def moved(model: RigidBody, x: Array, command: Array, time: float) -> Array:
 
 def flown_late(model: RigidBody, x: Array, sent: list[Array], delay: float, k: int) -> Array:
     """The state at period k + 1 of one at period k, where command i takes over at i periods and the delay."""
-    time, end = k * PERIOD, (k + 1) * PERIOD
+    time = k * PERIOD
+    end = (k + 1) * PERIOD
     switches = [i * PERIOD + delay for i in range(len(sent)) if time + 1e-9 < i * PERIOD + delay < end - 1e-9]
     for start, stop in itertools.pairwise([time, *switches, end]):
         acting = sum(i * PERIOD + delay <= start + 1e-9 for i in range(len(sent)))
@@ -125,7 +127,8 @@ def flown_late(model: RigidBody, x: Array, sent: list[Array], delay: float, k: i
 
 def measured(x: Array, k: int, acting: Array) -> tuple[StepInputs, Array]:
     state = np.zeros(N_STATES)
-    state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+    state[POSITIONS] = x[P]
+    state[VELOCITIES] = x[V]
     moment = StepInputs(
         time=k * PERIOD, acting=acting, attitude=x[Q] / np.linalg.norm(x[Q]), body_rates=x[W], phase=Phase.FLYING
     )
@@ -147,7 +150,8 @@ def test_the_state_is_predicted_to_when_the_command_acts(delay: float) -> None:
         controller.step(*measured(x, k, before), np.zeros((controller.horizon, 4)))
         sent.append(hover + rng.uniform(-40.0, 40.0, 4))
         asked = controller.asked[0]
-        ahead, late = x, delay
+        ahead = x
+        late = delay
         for j in range(k, k + 10):
             step = min(late, PERIOD)
             if step > 1e-9:
@@ -179,7 +183,8 @@ def test_the_reference_is_that_of_when_the_command_acts(delay: float) -> None:
     rows = PERIOD * np.arange(1, 11)[:, None] * [1.0, -0.5, 0.25, 3.0]
     now, state = measured(np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], np.zeros(6)]), 0, np.full(4, 400.0))
     controller.step(now, state, rows)
-    nodes, after = controller.asked[2], delay + PERIOD * np.arange(11)
+    nodes = controller.asked[2]
+    after = delay + PERIOD * np.arange(11)
     held = 10 - int(np.ceil(delay / PERIOD - 1e-9))  # from where on the last row is
     expected = after[1:held, None] * [1.0, -0.5, 0.25]
     np.testing.assert_allclose(nodes[1:held, P], expected, atol=1e-12)
@@ -226,12 +231,16 @@ def test_a_geometric_law_aims_at_where_the_course_is_when_the_command_acts(delay
 @pytest.mark.parametrize("late", [0.005, 0.02])
 def test_the_observer_of_forces_knows_which_command_was_in_force(late: float, lag: float | None) -> None:
     """Level, climbing and falling by thrusts that take over late in each period, of a model that is right."""
-    m, g = VEHICLE.mass, VEHICLE.gravity
+    m = VEHICLE.mass
+    g = VEHICLE.gravity
     observer = RampObserver(RampSettings(rotor_lag=lag), VEHICLE, PERIOD, late=late)
     speeds = [VEHICLE.hover_speed * factor for factor in (1.0, 1.1, 0.9, 1.2, 0.8)]
     observer.reset(np.full(4, speeds[0]))
-    velocity, rotor, before = 0.0, speeds[0], speeds[0]
-    level, still = np.eye(3), np.zeros(3)
+    velocity = 0.0
+    rotor = speeds[0]
+    before = speeds[0]
+    level = np.eye(3)
+    still = np.zeros(3)
     observer.update(PERIOD, np.array([0.0, 0.0, velocity]), level, still, np.full(4, before))
     steps = 2000
     for k, speed in enumerate(speeds * 2, start=2):
@@ -278,7 +287,8 @@ def test_targets_of_an_autopilot_are_less_than_a_period_late() -> None:
 
 @pytest.mark.parametrize(("mine", "its"), [(0.033, 0.033), (0.007, 0.06), (0.06, 0.007)])
 def test_commands_under_way_are_taken_over(mine: float, its: float) -> None:
-    previous, successor = law(its), law(mine)
+    previous = law(its)
+    successor = law(mine)
     hover = np.full(4, VEHICLE.hover_speed)
     previous.reset(hover)
     sent = [hover + 10.0 * i for i in range(1, 7)]

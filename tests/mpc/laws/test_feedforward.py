@@ -20,7 +20,8 @@ from quadsim.vehicle import Vehicle
 PERIOD = 0.002
 NONE = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
 DRAGS = [(0.0, 0.0, 0.0), (0.5, 0.5, 0.2), (0.6, 0.3, 0.1)]
-AMPLITUDES, RATES = np.array([2.0, 1.5, 0.5]), np.array([1.1, 1.7, 1.3])
+AMPLITUDES = np.array([2.0, 1.5, 0.5])
+RATES = np.array([1.1, 1.7, 1.3])
 PHASES = np.array([0.3, 1.0, 2.0])
 
 
@@ -46,10 +47,12 @@ def target_at(t: float) -> Target:
 
 def flat(vehicle: Vehicle, drag: Array, t: float) -> tuple[float, DesiredAttitude]:
     """Thrust [N] and attitude along the three sines."""
-    m, target = vehicle.mass, target_at(t)
+    m = vehicle.mass
+    target = target_at(t)
     force = m * (target.acceleration + np.array([0.0, 0.0, vehicle.gravity])), m * target.jerk, m * target.snap
     momentum = m * target.velocity, m * target.acceleration, m * target.jerk
-    c, s = np.cos(target.yaw), np.sin(target.yaw)
+    c = np.cos(target.yaw)
+    s = np.sin(target.yaw)
     heading = np.array([[c, s, 0.0], [-0.4 * s, 0.4 * c, 0.0], [-0.16 * c, -0.16 * s, 0.0]])
     desired = desired_attitude(force, momentum, drag, heading)
     return float(desired.attitude[:, 2] @ (force[0] + drag[2] * momentum[0])), desired
@@ -61,17 +64,22 @@ def test_open_loop_along_the_flat_inputs_the_vehicle_stays_on_the_trajectory(
 ) -> None:
     """The body with rotor drag, integrated under thrust and torque alone."""
     vehicle = replace(vehicle, inertia=(0.02, 0.03, 0.04))
-    D, J, m = np.array(drag), np.array(vehicle.inertia), vehicle.mass
+    D = np.array(drag)
+    J = np.array(vehicle.inertia)
+    m = vehicle.mass
 
     def slope(t: float, x: Array) -> Array:
         thrust, desired = flat(vehicle, D, t)
-        R, v, Omega = x[3:12].reshape(3, 3), x[12:15], x[15:]
+        R = x[3:12].reshape(3, 3)
+        v = x[12:15]
+        Omega = x[15:]
         torque = J * desired.acceleration + np.cross(desired.rates, J * desired.rates)
         acceleration = thrust / m * R[:, 2] - np.array([0.0, 0.0, vehicle.gravity]) - R @ (D * (R.T @ v))
         turning = (torque - np.cross(Omega, J * Omega)) / J
         return np.concatenate([v, (R @ hat(Omega)).ravel(), acceleration, turning])
 
-    begin, start = target_at(0.0), flat(vehicle, D, 0.0)[1]
+    begin = target_at(0.0)
+    start = flat(vehicle, D, 0.0)[1]
     x0 = np.concatenate([begin.position, start.attitude.ravel(), begin.velocity, start.rates])
     times = np.linspace(0.0, 3.0, 31)
     flown = solve_ivp(slope, (0.0, 3.0), x0, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12)
@@ -106,8 +114,10 @@ def test_a_motion_s_samples_give_its_derivatives_and_near_its_end_as_many_as_the
     period = 0.02
     samples = [sine(period * k)[:3] for k in range(40)]
     motion = motion_along(*np.array(samples).transpose(1, 0, 2), period=period, vehicle=vehicle)
-    law, preview = GeometricController(vehicle, period, Geometric(feedforward=True)), np.zeros((10, 4))
-    result, desired = law.target(preview, motion.after(10)), sine(10 * period)
+    law = GeometricController(vehicle, period, Geometric(feedforward=True))
+    preview = np.zeros((10, 4))
+    result = law.target(preview, motion.after(10))
+    desired = sine(10 * period)
     for value, exact, share in zip(
         (result.position, result.velocity, result.acceleration, result.jerk, result.snap),
         desired,

@@ -63,7 +63,8 @@ def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[
 def test_the_desired_rates_and_their_change_are_those_of_the_wanted_attitude(
     craft: Vehicle, build: Callable[..., Any]
 ) -> None:
-    law, h = build("geometric", craft), 1e-5
+    law = build("geometric", craft)
+    h = 1e-5
     now = wanted_after(law, craft, 0.0)[1]
     (R_after, after), (R_before, before) = wanted_after(law, craft, h), wanted_after(law, craft, -h)
     rates = vee(now.attitude.T @ (R_after - R_before) / (2.0 * h))
@@ -104,7 +105,8 @@ def test_a_force_beyond_the_tilt_limit_is_limited_and_counts_as_constant(
 
 def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """Where e_R itself would vanish, it turns with all its might."""
-    law, state = build("geometric", vehicle), make_state()
+    law = build("geometric", vehicle)
+    state = make_state()
     rest = {"position": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
     for yaw in (math.pi, -math.pi, 3.0):
         target = Target(**rest, yaw=yaw, yaw_rate=0.0, yaw_acceleration=0.0)
@@ -113,8 +115,10 @@ def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehic
 
 
 def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    law, integrals = build("geometric", vehicle, integral=True), NONE
-    law.numbers.sigma, law.numbers.sigma_R = 0.5, 0.25
+    law = build("geometric", vehicle, integral=True)
+    integrals = NONE
+    law.numbers.sigma = 0.5
+    law.numbers.sigma_R = 0.25
     for _ in range(200):
         _, desired = law.wrench(MOTION, TARGET, integrals)
         integrals = law.integrate(integrals, MOTION, TARGET, desired)
@@ -157,7 +161,8 @@ def test_the_gyroscopic_torque_of_a_spinning_body_is_compensated(
     hummingbird_like: Vehicle, build: Callable[..., Any]
 ) -> None:
     """Upright, with errors of rate alone, J Omega' is -J k_Omega Omega and nothing else."""
-    law, inertia = build("geometric", hummingbird_like), np.array(hummingbird_like.inertia)
+    law = build("geometric", hummingbird_like)
+    inertia = np.array(hummingbird_like.inertia)
     rates = np.array([0.5, -0.4, 0.6])
     motion = Measured(position=np.zeros(3), velocity=np.zeros(3), attitude=np.eye(3), rates=rates, yaw=0.0)
     rest = {"position": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
@@ -169,7 +174,8 @@ def test_the_gyroscopic_torque_of_a_spinning_body_is_compensated(
 
 def test_integrals_rest_while_the_rotors_have_no_more(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """Twenty periods far below the target at full thrust leave nothing to unwind."""
-    controller, place = build("geometric", vehicle, integral=True), np.zeros((10, 4))
+    controller = build("geometric", vehicle, integral=True)
+    place = np.zeros((10, 4))
     below = make_state(position=(0.0, 0.0, -30.0))
     for _ in range(20):
         assert controller.step(StepInputs(), below, place).speeds.max() == pytest.approx(vehicle.speed_max)

@@ -21,7 +21,8 @@ class InC:
     """A law of C without the fallback contract, query and optimum by query and optimum."""
 
     def __init__(self, law: Exportable) -> None:
-        self._library, self._problem = core_library(), core_problem(law.problem)
+        self._library = core_library()
+        self._problem = core_problem(law.problem)
         self.controller = struct("quadsim_controller")(problem=ctypes.addressof(self._problem.struct))
         set_members(self.controller, **controller_numbers(law.problem))
         self.memory = np.zeros(self._library.quadsim_mpc_reals(self.controller))
@@ -49,8 +50,10 @@ PAPERS = (
 )
 def test_the_exported_c_answers_as_flights_in_python(name: str) -> None:
     scenario = quadsim.load(name)
-    recording, law = record(scenario), exported_law(scenario)
-    c, horizon = InC(law), law.problem.horizon
+    recording = record(scenario)
+    law = exported_law(scenario)
+    c = InC(law)
+    horizon = law.problem.horizon
     apart = 0.0
     for k, (state, acting) in enumerate(zip(recording.state, recording.acting, strict=True)):
         status, command = c.solve(state, recording.path[k : k + horizon], acting)

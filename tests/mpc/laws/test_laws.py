@@ -52,7 +52,8 @@ def test_at_rest_on_the_reference_the_command_is_hover(law: str, craft: Vehicle,
 def test_errors_are_answered_the_right_way_at_any_heading(law: str, craft: Vehicle, build: Build, yaw: float) -> None:
     """A target ahead pitches forward, tau_y > 0; one to the left rolls left, tau_x < 0; up is thrust."""
     psi = math.radians(yaw)
-    controller, state = build(law, craft), make_state(euler=(0.0, 0.0, psi))
+    controller = build(law, craft)
+    state = make_state(euler=(0.0, 0.0, psi))
     weight = craft.mass * craft.gravity
     for offset, axis, sign in (((1.0, 0.0), 2, 1.0), ((0.0, 1.0), 1, -1.0)):
         x = 0.2 * (math.cos(psi) * offset[0] - math.sin(psi) * offset[1])
@@ -66,7 +67,8 @@ def test_errors_are_answered_the_right_way_at_any_heading(law: str, craft: Vehic
 
 
 def test_without_its_heading_frame_the_lqr_pushes_the_wrong_way_round(vehicle: Vehicle, build: Build) -> None:
-    state, pose = make_state(euler=(0.0, 0.0, math.pi)), [-0.2, 0.0, 0.0, math.pi]
+    state = make_state(euler=(0.0, 0.0, math.pi))
+    pose = [-0.2, 0.0, 0.0, math.pi]
     assert first_wrench(build("lqr", vehicle), vehicle, state, pose)[2] > 0.0
     assert first_wrench(build("lqr", vehicle, heading=False), vehicle, state, pose)[2] < 0.0
 
@@ -86,8 +88,10 @@ def test_a_target_that_moves_is_followed_with_its_velocity(law: str, craft: Vehi
 def test_a_state_or_reference_that_is_not_finite_is_refused_and_forgotten(
     law: str, vehicle: Vehicle, build: Build, value: float
 ) -> None:
-    controller, other = build(law, vehicle), build(law, vehicle)
-    state, pose = make_state(position=(0.1, 0.2, 0.3)), [0.0, 0.0, 0.0, 0.1]
+    controller = build(law, vehicle)
+    other = build(law, vehicle)
+    state = make_state(position=(0.1, 0.2, 0.3))
+    pose = [0.0, 0.0, 0.0, 0.1]
     broken = state.copy()
     broken[INDEX["vx"]] = value
     with pytest.raises(CommandError, match="vx"):
@@ -119,7 +123,8 @@ def test_on_the_ground_rotors_are_stopped_as_fast_as_slews_allow(
 def test_integrals_wait_for_the_flight(law: str, vehicle: Vehicle, build: Build) -> None:
     """Armed on the ground an error that cannot be mended is not summed; in flight it is."""
     others = {"integral": True} if law == "geometric" else {}
-    state, pose = make_state(), [0.05, 0.0, 0.05, 0.0]
+    state = make_state()
+    pose = [0.05, 0.0, 0.05, 0.0]
     answers = {}
     for phase in (Phase.ARMED, Phase.FLYING):
         controller = build(law, vehicle, **others)
@@ -140,7 +145,8 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
     before = rng.uniform(0.0, 250.0, 4)
     controller.reset(before)
     for _ in range(3):
-        state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
+        state = size * rng.normal(size=12)
+        pose = size * rng.normal(size=4)
         speeds = controller.step(StepInputs(), state, held(controller, pose)).speeds
         assert np.isfinite(speeds).all()
         assert speeds.min() >= 0.0
@@ -152,10 +158,12 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
 
 @pytest.mark.parametrize("size", [1e2, 1e4, 1e6])
 def test_default_bounds_are_the_vehicles(law: str, craft: Vehicle, build: Build, size: float) -> None:
-    rng, controller = np.random.default_rng(0), build(law, craft)
+    rng = np.random.default_rng(0)
+    controller = build(law, craft)
     extremes = []
     for _ in range(12):
-        state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
+        state = size * rng.normal(size=12)
+        pose = size * rng.normal(size=4)
         extremes.append(controller.step(StepInputs(), state, held(controller, pose)).speeds)
     assert np.min(extremes) >= craft.speed_min
     assert np.max(extremes) <= craft.speed_max

@@ -69,7 +69,10 @@ def integrated(vehicle: Vehicle, state: Array, command: Array, time: float, atti
     lags = np.array(LAGS[1:])
 
     def slope(_: float, at: Array) -> Array:
-        position_velocity, euler, rates, turn = at[:6], at[6:9], at[9:12], at[12:]
+        position_velocity = at[:6]
+        euler = at[6:9]
+        rates = at[9:12]
+        turn = at[12:]
         roll, pitch, yaw = euler
         axis = np.array(
             [

@@ -45,7 +45,8 @@ def pid_law(controller: CascadedPID) -> Law:
 
 def geometric_law(controller: GeometricController, allocation: Any) -> Law:
     def law(state: Array, memory: Array) -> tuple[Array, Array]:
-        integrals, motion = Integrals(translation=memory[:3], rotation=memory[3:]), motion_of(state)
+        integrals = Integrals(translation=memory[:3], rotation=memory[3:])
+        motion = motion_of(state)
         wrench, desired = controller.wrench(motion, AT_REST, integrals)
         after = controller.integrate(integrals, motion, AT_REST, desired)
         return allocate(allocation, wrench, *NO_BOUNDS), np.concatenate([after.translation, after.rotation])
@@ -55,7 +56,8 @@ def geometric_law(controller: GeometricController, allocation: Any) -> Law:
 
 def jacobian(law: Law, size: int) -> tuple[Array, Array]:
     """(4, size) and (size - 12, size): how speeds and memory follow state and memory, at hover."""
-    h, columns = 1e-5, []
+    h = 1e-5
+    columns = []
     for direction in np.eye(size):
         ends = [np.concatenate(law(s * h * direction[:12], s * h * direction[12:])) for s in (1.0, -1.0)]
         columns.append((ends[0] - ends[1]) / (2.0 * h))
@@ -74,11 +76,14 @@ def spectral_radius(vehicle: Vehicle, law: Law, memory: int, *, lag: float = 0.0
     A_new, B_new = discretise(A, B, PERIOD - delay)
     K, M = jacobian(law, 12 + memory)
     seen = np.zeros((12 + memory, n + 4 + memory))  # what the law sees of [state and rotors, last command, memory]
-    seen[:12, :12], seen[12:, n + 4 :] = np.eye(12), np.eye(memory)
+    seen[:12, :12] = np.eye(12)
+    seen[12:, n + 4 :] = np.eye(memory)
     period = np.zeros((n + 4 + memory,) * 2)
-    period[:n, :n], period[:n, n : n + 4] = A_new @ A_old, A_new @ B_old
+    period[:n, :n] = A_new @ A_old
+    period[:n, n : n + 4] = A_new @ B_old
     period[:n] += B_new @ K @ seen
-    period[n : n + 4], period[n + 4 :] = K @ seen, M @ seen
+    period[n : n + 4] = K @ seen
+    period[n + 4 :] = M @ seen
     return float(np.abs(np.linalg.eigvals(period)).max())
 
 
@@ -89,7 +94,8 @@ def law_of(name: str, vehicle: Vehicle, build: Callable[..., Any]) -> tuple[Law,
         gain = build("lqr", vehicle).gain
         return (lambda state, memory: (-gain @ state, memory)), 0
     controller = build("geometric", vehicle, integral=name == "geometric with integrals")
-    law, allocation = geometric_law(controller, build("pid", vehicle).allocation), 6
+    law = geometric_law(controller, build("pid", vehicle).allocation)
+    allocation = 6
     if name == "geometric with integrals":
         return law, allocation
     return (lambda state, memory: (law(state, np.zeros(6))[0], memory)), 0
@@ -107,7 +113,8 @@ def test_every_loop_is_stable_at_20_hz_with_rotor_lag(name: str, craft: Vehicle,
 def test_the_feed_forward_separates_position_from_attitude(craft: Vehicle, build: Callable[..., Any]) -> None:
     """(s^2 + k_Omega s + k_R)(s^2 + k_v s + k_x): fed back continuously, both pairs are where their gains put them."""
     controller = build("geometric", craft)
-    law, gains = geometric_law(controller, build("pid", craft).allocation), controller.gains
+    law = geometric_law(controller, build("pid", craft).allocation)
+    gains = controller.gains
     K, _ = jacobian(lambda state, memory: (law(state, np.zeros(6))[0], memory), 12)
     A, B = continuous_model(craft)
     poles = np.linalg.eigvals(A + B @ K)
@@ -121,12 +128,14 @@ def test_the_cascade_has_the_characteristic_ratios_of_its_design(vehicle: Vehicl
     none = dict.fromkeys(("velocity_integral", "rate_integral", "velocity_derivative", "rate_derivative"), 0.0)
     controller = build("pid", vehicle)
     controller.gains = replace(controller.gains, **none)
-    law, k = pid_law(controller), controller.gains.bandwidths
+    law = pid_law(controller)
+    k = controller.gains.bandwidths
     K, _ = jacobian(lambda state, memory: (law(state, np.zeros(12))[0], memory), 12)
     A, B = continuous_model(vehicle)
     poles = np.linalg.eigvals(A + B @ K)
     horizontal = np.cumprod([1.0, k.rate, k.attitude, k.velocity, k.position])
-    vertical, heading = np.cumprod([1.0, k.velocity, k.position]), np.cumprod([1.0, k.yaw_rate, k.yaw])
+    vertical = np.cumprod([1.0, k.velocity, k.position])
+    heading = np.cumprod([1.0, k.yaw_rate, k.yaw])
     expected = np.polymul(np.polymul(horizontal, horizontal), np.polymul(vertical, heading))
     np.testing.assert_allclose(np.poly(poles).real, expected, rtol=1e-5)
 
@@ -134,8 +143,11 @@ def test_the_cascade_has_the_characteristic_ratios_of_its_design(vehicle: Vehicl
 def test_the_gain_solves_the_riccati_equation(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """P = Q + A' P (A - B K), with P found by summing the cost of the closed loop, not by the solver."""
     controller = build("lqr", vehicle)
-    model, objective = controller.model, controller.objective
-    A, B, K = model.A, model.B, controller.gain
+    model = controller.model
+    objective = controller.objective
+    A = model.A
+    B = model.B
+    K = controller.gain
     closed = A - B @ K
     P = scipy.linalg.solve_discrete_lyapunov(closed.T, objective.Q_y + K.T @ objective.Q_u @ K)
     np.testing.assert_allclose(K, np.linalg.solve(objective.Q_u + B.T @ P @ B, B.T @ P @ A), rtol=1e-6, atol=1e-9)

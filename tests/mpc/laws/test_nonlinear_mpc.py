@@ -38,7 +38,8 @@ def law(
     bounds: ActuatorBounds | None = None, constraints: tuple[Constraint, ...] = (), **settings: Any
 ) -> NonlinearMPC:
     """Of nodes of two periods; the horizon is in nodes."""
-    nodes, tolerance = settings.pop("horizon", 10), settings.pop("tolerance", STEP_TOLERANCE)
+    nodes = settings.pop("horizon", 10)
+    tolerance = settings.pop("tolerance", STEP_TOLERANCE)
     made = Nonlinear(horizon=2 * nodes, node=2.0 * PERIOD, **settings)
     return NonlinearMPC(
         VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints, tolerance=tolerance
@@ -50,7 +51,8 @@ def call(
 ) -> Command:
     """The answer at a state (13,)."""
     state = np.zeros(N_STATES)
-    state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+    state[POSITIONS] = x[P]
+    state[VELOCITIES] = x[V]
     preview = np.zeros((controller.horizon, 4)) if reference is None else reference
     return controller.step(StepInputs(time=time, attitude=x[Q], body_rates=x[W], **moment), state, preview)
 
@@ -91,7 +93,8 @@ def still(samples: int, attitude: Array, position: Array | None = None) -> Motio
 
 def test_its_residual_is_that_of_the_plan_that_is_commanded() -> None:
     """States predicted by the QP against the model rolled out from each, which one step from hover does not follow."""
-    controller, x0 = law(horizon=20), at_rest((0.0, 1.0, 0.0, 0.0))
+    controller = law(horizon=20)
+    x0 = at_rest((0.0, 1.0, 0.0, 0.0))
     command = call(controller, x0)
     plan = controller.stored_plan
     assert plan is not None
@@ -109,7 +112,8 @@ def test_its_residual_is_that_of_the_plan_that_is_commanded() -> None:
 
 def test_more_iterations_converge_where_one_does_not() -> None:
     x0 = at_rest((0.0, 1.0, 0.0, 0.0))
-    once, often = law(horizon=20), law(horizon=20, iterations=50)
+    once = law(horizon=20)
+    often = law(horizon=20, iterations=50)
     command = call(often, x0)
     assert command.stats.sqp_defect < 1e-6
     assert command.status in OPTIMAL
@@ -146,14 +150,18 @@ def test_converged_it_is_the_optimum_of_an_independent_solver(error: str, inputs
         horizon=4, iterations=100, tolerance=1e-9, inputs=inputs, attitude_error=error, weights=weights, terminal=3.0
     )
     x0 = at_rest((0.98, 0.15, -0.1, 0.05))
-    x0[P], x0[V], x0[W] = (0.2, -0.1, -0.8), (0.5, 0.2, -0.4), (0.3, -0.5, 0.2)
+    x0[P] = (0.2, -0.1, -0.8)
+    x0[V] = (0.5, 0.2, -0.4)
+    x0[W] = (0.3, -0.5, 0.2)
     command = call(controller, x0)
     model = rigid_body(VEHICLE, 2 * PERIOD, inputs=inputs)
     hover = model.shares(np.full(4, VEHICLE.mass * VEHICLE.gravity / 4.0))
 
     def costs(flat: Array) -> Array:
         """(K,) of K sequences of inputs (K, 16), rolled out at once."""
-        u, x, total = flat.reshape(-1, 4, 4), np.tile(x0, (len(flat), 1)), np.zeros(len(flat))
+        u = flat.reshape(-1, 4, 4)
+        x = np.tile(x0, (len(flat), 1))
+        total = np.zeros(len(flat))
         for i in range(4):
             x = advance_nodes(model, x, u[:, i])
             turned = x[:, Q] - [1, 0, 0, 0] if error == "difference" else 2.0 * x[:, 4:7]
@@ -339,7 +347,8 @@ def test_velocities_and_slews_are_bounded() -> None:
 
 
 def test_rows_not_linear_in_the_model_are_refused() -> None:
-    angle, speed = np.zeros((1, N_STATES)), np.array([[1.0, 0.0, 0.0, 0.0]])
+    angle = np.zeros((1, N_STATES))
+    speed = np.array([[1.0, 0.0, 0.0, 0.0]])
     angle[0, INDEX["roll"]] = 1.0
     one = {"name": "mine", "lower": np.array([-1.0]), "upper": np.array([1.0])}
     with pytest.raises(ParameterError, match=r"controller\.mine"):
@@ -355,7 +364,8 @@ def test_rows_not_linear_in_the_model_are_refused() -> None:
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, 1e7])
 def test_invalid_numbers_are_refused_without_side_effects(number: float) -> None:
-    controller, fresh = law(), law()
+    controller = law()
+    fresh = law()
     wrong = at_rest()
     wrong[0] = number
     command = call(controller, wrong)
@@ -367,7 +377,8 @@ def test_invalid_numbers_are_refused_without_side_effects(number: float) -> None
 
 def test_without_attitude_in_the_moment_it_is_taken_from_the_state() -> None:
     state = np.zeros(N_STATES)
-    state[INDEX["roll"]], state[INDEX["pitch_rate"]] = 0.3, 0.4
+    state[INDEX["roll"]] = 0.3
+    state[INDEX["pitch_rate"]] = 0.4
     reference = np.zeros((20, 4))
     x = at_rest((math.cos(0.15), math.sin(0.15), 0.0, 0.0))
     # d(pitch)/dt = q cos(roll) - r sin(roll) alone, and no yaw rate
@@ -419,13 +430,15 @@ def test_predictions_match_the_model(observer: ObserverSettings | None) -> None:
 def test_turning_the_world_about_the_vertical_turns_the_answer_with_it() -> None:
     """Position, velocity and attitude turned by one yaw, and the reference's yaw too: the same rotor speeds."""
     x = at_rest((0.9, 0.3, -0.2, 0.1))
-    x[P], x[V] = (0.5, -0.2, 0.3), (0.1, 0.4, 0.0)
+    x[P] = (0.5, -0.2, 0.3)
+    x[V] = (0.1, 0.4, 0.0)
     even = Weights(position=10.0, velocity=0.3)
     plain = call(law(weights=even), x)
     yaw = 2.0
     turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     other = x.copy()
-    other[P], other[V] = turn @ x[P], turn @ x[V]
+    other[P] = turn @ x[P]
+    other[V] = turn @ x[V]
     other[Q] = multiply(np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]), x[Q])
     reference = np.zeros((20, 4))
     reference[:, 3] = yaw

@@ -118,7 +118,7 @@ def test_it_is_in_the_json_schema_with_its_field(answers: dict[str, Any]) -> Non
     status, out, _ = answers["schema"]
     definitions = json.loads(out)["$defs"]
     field = definitions["PDTable"]["properties"]["bandwidth"]
-    assert (status, field["exclusiveMinimum"], field["maximum"]) == (0, 0.0, 10.0)
+    assert (status, field["minimum"], field["maximum"]) == (0, 0.1, 10.0)
     assert "pd" in definitions["Plugin"]["properties"]["type"]["not"]["enum"]
 
 

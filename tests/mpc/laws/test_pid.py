@@ -98,7 +98,8 @@ def test_without_a_limit_of_tilt_the_lqr_is_linear(vehicle: Vehicle, build: Call
 
 def test_derivatives_act_on_the_measurement_not_on_the_error(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """A target that jumps is not differentiated; a velocity that rises is held back."""
-    controller, state = build("pid", vehicle), make_state()
+    controller = build("pid", vehicle)
+    state = make_state()
     _, memory = one_period(controller, vehicle, state)
     jumped = replace(REST, position=np.array([0.0, 0.0, 0.1]))
     first = one_period(controller, vehicle, state, target=jumped, memory=memory)[0]

@@ -26,7 +26,8 @@ from quadsim.state import INDEX, N_STATES, Array, wrapped
 def prepared(name: str, changes: dict[str, Any] | None = None) -> RobustPreparation:
     """The preparation of a robust scenario."""
     scenario = quadsim.load(name, changes or {})
-    table, vehicle = scenario.controller, Assembly(scenario).vehicle
+    table = scenario.controller
+    vehicle = Assembly(scenario).vehicle
     assert isinstance(table, Robust)
     return RobustPreparation(vehicle, table.problem(vehicle, scenario.control_period), table)
 
@@ -121,8 +122,10 @@ def test_queries_are_those_of_numpy(parts: str) -> None:
     scenario = quadsim.load("robust-lag50", changes | {"computation.delay": changes.get("controller.delay", 0.0)})
     assert isinstance(scenario.controller, Robust)
     twin = NumpyPreparation(Assembly(scenario).vehicle, preparation.problem, scenario.controller)
-    rng, time = np.random.default_rng(3), 0.0
-    hover, period = preparation.problem.model.u_bar, preparation.problem.model.period
+    rng = np.random.default_rng(3)
+    time = 0.0
+    hover = preparation.problem.model.u_bar
+    period = preparation.problem.model.period
     unseen = np.zeros(N_STATES)
     unseen[INDEX["vz"]] = 1.0
     if twin.observer is not None:
@@ -133,7 +136,8 @@ def test_queries_are_those_of_numpy(parts: str) -> None:
         phase = Phase.LANDED if k in (10, 11) else Phase.ARMED if k == 12 else Phase.FLYING
         predicted = k in (20, 21)
         now = StepInputs(time=time, phase=phase, unseen=unseen if predicted else None)
-        state, acting = 0.1 * rng.standard_normal(N_STATES), hover + rng.uniform(-5.0, 5.0, 4)
+        state = 0.1 * rng.standard_normal(N_STATES)
+        acting = hover + rng.uniform(-5.0, 5.0, 4)
         reference = np.cumsum(0.05 * rng.standard_normal((preparation.problem.horizon, 4)), axis=0)
         reference[:, 3] = wrapped(reference[:, 3] + 3.1)  # across the half turn
         if phase is Phase.LANDED:
@@ -205,7 +209,8 @@ def test_controllers_share_no_mutable_state(mpc: LinearMPC) -> None:
 
 def test_the_answerer_is_reported(mpc: LinearMPC) -> None:
     hover = mpc.problem.model.u_bar
-    at_rest, target = np.zeros(N_STATES), np.zeros((mpc.horizon, 4))
+    at_rest = np.zeros(N_STATES)
+    target = np.zeros((mpc.horizon, 4))
     free = mpc.step(StepInputs(time=0.0, phase=Phase.FLYING), at_rest, target)
     assert (free.status, free.answered_by, free.stats.active) == ("unconstrained", GAIN, 0)
     assert free.speeds == pytest.approx(hover)
@@ -216,7 +221,8 @@ def test_the_answerer_is_reported(mpc: LinearMPC) -> None:
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e300])
 def test_numbers_out_of_hand_are_refused_with_the_command_in_force(mpc: LinearMPC, wrong: float) -> None:
-    hover, state = mpc.problem.model.u_bar, np.zeros(N_STATES)
+    hover = mpc.problem.model.u_bar
+    state = np.zeros(N_STATES)
     for name in INDEX:
         broken = state.copy()
         broken[INDEX[name]] = wrong
@@ -247,7 +253,8 @@ def test_a_disturbance_is_learned_in_flight_alone_and_from_what_is_measured() ->
 
 def test_the_largest_violation_of_a_soft_bound_is_reported_on_either_side() -> None:
     """Tilted by 0.2 rad where 0.087 are allowed, it takes more than a period to come back."""
-    mpc, slacks = law_by_core("robust"), []
+    mpc = law_by_core("robust")
+    slacks = []
     for side in (-1.0, 1.0):
         mpc.reset(mpc.problem.model.u_bar)
         tilted = np.zeros(N_STATES)
@@ -260,7 +267,8 @@ def test_the_largest_violation_of_a_soft_bound_is_reported_on_either_side() -> N
 
 def test_the_structs_have_all_numbers_in_place() -> None:
     scenario = quadsim.load("robust-lag50")
-    preparation, vehicle = prepared("robust-lag50"), Assembly(scenario).vehicle
+    preparation = prepared("robust-lag50")
+    vehicle = Assembly(scenario).vehicle
     assert isinstance(scenario.controller, Robust)
     for name, value in robust_numbers(scenario.controller, vehicle, scenario.control_period).items():
         assert np.array_equal(np.ravel(value), np.ravel(getattr(preparation._robust, name)))

@@ -21,7 +21,8 @@ def test_a_parabola_is_differentiated_exactly(samples: int) -> None:
 
 def test_a_jump_of_the_velocity_becomes_a_hump_of_its_area() -> None:
     """Summed over the flight, the acceleration fed forward is the jump; it never pulls the other way."""
-    period, samples = 0.05, 10
+    period = 0.05
+    samples = 10
     ramp = np.maximum(0.0, 6.0 * period * (np.arange(80) - 40))
     operator = differentiator(samples, period)
     accelerations = np.array([operator[2] @ ramp[k + 1 : k + 1 + samples] for k in range(80 - samples)])

@@ -64,9 +64,11 @@ def model_of(step: float = 0.05, lag: tuple[float, ...] = LAG, **others: Any) ->
 def points(count: int = 6) -> tuple[Array, Array]:
     """States (count, 14) at any attitude, and targets as shares (count, 4)."""
     rng = np.random.default_rng(0)
-    x, u = rng.normal(size=(count, 14)), 0.2 * rng.normal(size=(count, 4))
+    x = rng.normal(size=(count, 14))
+    u = 0.2 * rng.normal(size=(count, 4))
     x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
-    x[:, N_BODY], u[:, 0] = rng.uniform(0.1, 0.9, (2, count))
+    x[:, N_BODY] = rng.uniform(0.1, 0.9, count)
+    u[:, 0] = rng.uniform(0.1, 0.9, count)
     return x, u
 
 
@@ -81,26 +83,32 @@ def test_derivatives_are_those_of_finite_differences(
     x, u = points()
     A, B, end = linearise_nodes(model, x, u)
     np.testing.assert_allclose(end, advance_nodes(model, x, u), rtol=1e-12, atol=1e-12)
-    for result, width in ((A, 14), (B, 4)):
-        for j in range(width):
-            d = 1e-5 * np.eye(width)[j]
-            pairs = ((x + d, u), (x - d, u)) if width == 14 else ((x, u + d), (x, u - d))
-            above, below = (advance_nodes(model, *pair) for pair in pairs)
-            expected = (above - below) / 2e-5
-            np.testing.assert_allclose(result[:, :, j], expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+    def check(result: Array, above: Array, below: Array) -> None:
+        expected = (above - below) / 2e-5
+        np.testing.assert_allclose(result, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+    for j, d in enumerate(1e-5 * np.eye(14)):
+        check(A[:, :, j], advance_nodes(model, x + d, u), advance_nodes(model, x - d, u))
+    for j, d in enumerate(1e-5 * np.eye(4)):
+        check(B[:, :, j], advance_nodes(model, x, u + d), advance_nodes(model, x, u - d))
 
 
 def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
-    model, (x, u) = model_of(), points(3)
+    model = model_of()
+    x, u = points(3)
     frames = np.random.default_rng(1).normal(size=(4, 4))
     frames /= np.linalg.norm(frames, axis=1, keepdims=True)
-    (A, B, end), (plain, inputs, same) = linearise_nodes(model, x, u, frames), linearise_nodes(model, x, u)
-    np.testing.assert_array_equal(end, same)
+    A, B, end = linearise_nodes(model, x, u, frames)
+    A_plain, B_plain, end_plain = linearise_nodes(model, x, u)
+    np.testing.assert_array_equal(end, end_plain)
     for i in range(3):
-        before, after = np.eye(14), np.eye(14)
-        before[Q, Q], after[Q, Q] = frame(frames[i]), frame(frames[i + 1])
-        np.testing.assert_allclose(A[i], after @ plain[i] @ before.T, atol=1e-12)
-        np.testing.assert_allclose(B[i], after @ inputs[i], atol=1e-12)
+        before = np.eye(14)
+        after = np.eye(14)
+        before[Q, Q] = frame(frames[i])
+        after[Q, Q] = frame(frames[i + 1])
+        np.testing.assert_allclose(A[i], after @ A_plain[i] @ before.T, atol=1e-12)
+        np.testing.assert_allclose(B[i], after @ B_plain[i], atol=1e-12)
 
 
 @pytest.mark.parametrize("step", [1e-3, 0.05, 1.0, 30.0])
@@ -116,18 +124,23 @@ def test_rates_and_thrust_follow_exactly_whatever_the_step(step: float) -> None:
 @pytest.mark.parametrize("others", OTHERS)
 def test_it_moves_by_the_equations_of_the_rigid_body_and_four_lags(others: dict[str, Any]) -> None:
     """A variable-step integrator of the equations as they are written; lags of 0 act at once."""
-    (x, u), model = points(1), model_of(0.05, substeps=50, **others)
+    x, u = points(1)
+    model = model_of(0.05, substeps=50, **others)
     target = model.scale * u[0]
 
     def slopes(_: float, y: Array) -> Array:
-        q, v, omega, T = y[Q], y[V], y[W], y[N_BODY]
-        R, (w, *vector) = rotation(q), q
-        air = R.T @ v
+        w, *vector = y[Q]
+        omega = y[W]
+        thrust = y[N_BODY]
+        R = rotation(y[Q])
+        air = R.T @ y[V]
         drag = -(model.drag + model.quadratic_drag * np.abs(air)) * air
-        force = np.array([0.0, 0.0, model.thrust_scale * T]) + drag
-        turn = 0.5 * np.array([-np.dot(vector, omega), *(w * omega + np.cross(vector, omega))])
-        v_slope = R @ force / VEHICLE.mass + model.acceleration - [0.0, 0.0, VEHICLE.gravity]
-        return np.concatenate([v, turn, v_slope, (target[1:] - omega) / LAG[1:], [(target[0] - T) / LAG[0]]])
+        force = np.array([0.0, 0.0, model.thrust_scale * thrust]) + drag
+        of_quaternion = 0.5 * np.array([-np.dot(vector, omega), *(w * omega + np.cross(vector, omega))])
+        of_velocity = R @ force / VEHICLE.mass + model.acceleration - [0.0, 0.0, VEHICLE.gravity]
+        of_rates = (target[1:] - omega) / LAG[1:]
+        of_thrust = (target[0] - thrust) / LAG[0]
+        return np.concatenate([y[V], of_quaternion, of_velocity, of_rates, [of_thrust]])
 
     start = x[0] * np.array([*[1.0] * N_BODY, model.scale[0]])
     end = solve_ivp(slopes, (0.0, 0.05), start, rtol=1e-11, atol=1e-12).y[:, -1]
@@ -149,7 +162,25 @@ def table(**fields: Any) -> Nonlinear:
 def at_rest(**plant: Any) -> Array:
     """(14,) hover, with the thrust that the plant needs."""
     x = np.zeros(14)
-    x[3], x[N_BODY] = 1.0, LEVEL[0] / model_of().scale[0] / plant.get("thrust_scale", 1.0)
+    x[3] = 1.0
+    x[N_BODY] = LEVEL[0] / model_of().scale[0] / plant.get("thrust_scale", 1.0)
+    return x
+
+
+def measured(x: Array) -> Array:
+    """The state (12,) of a body x."""
+    state = np.zeros(N_STATES)
+    state[POSITIONS] = x[P]
+    state[VELOCITIES] = x[V]
+    state[ANGLES] = quaternion_to_euler(x[Q])
+    state[ANGLE_RATES] = body_to_euler_rates(state[ANGLES], x[W])
+    return state
+
+
+def normalised(x: Array) -> Array:
+    """A body whose quaternion has length one."""
+    x = x.copy()
+    x[Q] /= np.linalg.norm(x[Q])
     return x
 
 
@@ -162,17 +193,17 @@ def fly(
 ) -> tuple[Array, list[Command]]:
     """States (K, 14) every 5 ms above an inner loop of exact lags, and the commands."""
     model = model_of(5e-3, **{"lag": LAG, **plant})
-    x, states, commands = at_rest(**plant) if x is None else x, [], []
+    if x is None:
+        x = at_rest(**plant)
+    states = []
+    commands = []
     for k in range(round(seconds / period)):
-        state, euler = np.zeros(N_STATES), quaternion_to_euler(x[Q])
-        state[POSITIONS], state[VELOCITIES], state[ANGLES] = x[P], x[V], euler
-        state[ANGLE_RATES] = body_to_euler_rates(euler, x[W])
         preview = np.array([course((k + 1 + i) * period) for i in range(controller.horizon)])
         now = StepInputs(time=k * period, attitude=x[Q].copy(), body_rates=x[W].copy())
-        commands.append(controller.step(now, state, preview))
+        command = controller.step(now, measured(x), preview)
+        commands.append(command)
         for _ in range(round(200.0 * period)):
-            x = advance_nodes(model, x, commands[-1].speeds / model.scale)
-            x[Q] /= np.linalg.norm(x[Q])
+            x = normalised(advance_nodes(model, x, command.speeds / model.scale))
             states.append(x)
     return np.array(states), commands
 
@@ -188,7 +219,8 @@ def test_it_follows_a_previewed_step_quickly_with_small_overshoot(axis: int) -> 
     target[axis] = 1.0
     states, commands = fly(build(table(), VEHICLE, 0.02), 0.02, 2.5, step_of(*target))
     way = states[:, axis]
-    assert 5e-3 * np.argmax(way > 0.9) - 0.5 < 0.3
+    rise = 5e-3 * np.argmax(way > 0.9) - 0.5
+    assert rise < 0.3
     assert way.max() < 1.06
     np.testing.assert_allclose(states[-1, P], target[:3], atol=5e-3)
     bounds = TargetBounds().actuators(VEHICLE)
@@ -230,7 +262,8 @@ def test_targets_and_body_rates_hold_their_bounds() -> None:
 
 
 def test_bounds_of_targets_follow_the_vehicle() -> None:
-    largest, least = 4.0 * VEHICLE.thrust_coefficient * VEHICLE.speed_max**2, 0.5 * VEHICLE.mass * VEHICLE.gravity
+    largest = 4.0 * VEHICLE.thrust_coefficient * VEHICLE.speed_max**2
+    least = 0.5 * VEHICLE.mass * VEHICLE.gravity
     bounds = TargetBounds().actuators(VEHICLE)
     np.testing.assert_allclose(bounds.u_min, [least, *np.radians([-300.0, -300.0, -90.0])])
     np.testing.assert_allclose(bounds.u_max, [0.9 * largest, *np.radians([300.0, 300.0, 90.0])])
@@ -242,10 +275,9 @@ def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
     made = build(table(), VEHICLE, 0.02)
     least = [TargetBounds().actuators(VEHICLE).u_min[0], 0.0, 0.0, 0.0]
     for controller in (made, made.law):  # type: ignore[attr-defined]
-        now = StepInputs(phase=Phase.LANDED)
-        np.testing.assert_allclose(
-            controller.step(now, np.zeros(N_STATES), np.zeros((controller.horizon, 4))).speeds, least
-        )
+        preview = np.zeros((controller.horizon, 4))
+        command = controller.step(StepInputs(phase=Phase.LANDED), np.zeros(N_STATES), preview)
+        np.testing.assert_allclose(command.speeds, least)
 
 
 @pytest.mark.slow("nonlinear")
@@ -270,23 +302,27 @@ def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: b
     world = controller.law.struct.world  # type: ignore[attr-defined]
     np.testing.assert_allclose(states[-1, P], 0.0, atol=2e-3)
     assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=2e-3)
-    assert world.thrust_scale == pytest.approx(0.8 if scaled else 1.0, abs=2e-3)
-    assert world.acceleration[2] == pytest.approx(0.0 if scaled else -0.2 * LEVEL[0] / 0.8 / VEHICLE.mass, abs=0.05)
+    thrust_scale = 1.0
+    acceleration = -0.2 * LEVEL[0] / 0.8 / VEHICLE.mass
+    if scaled:
+        thrust_scale = 0.8
+        acceleration = 0.0
+    assert world.thrust_scale == pytest.approx(thrust_scale, abs=2e-3)
+    assert world.acceleration[2] == pytest.approx(acceleration, abs=0.05)
     np.testing.assert_array_equal(np.array(world.angular), 0.0)
     controller.step(StepInputs(phase=Phase.LANDED), np.zeros(N_STATES), np.zeros((controller.horizon, 4)))
     assert world.thrust_scale == 1.0
 
 
-def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
+def test_a_controller_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
     made = Nonlinear(disturbance=RampSettings(thrust_scale=True), inputs="speed", horizon=20, terminal="lqr")
     controller = build(made, VEHICLE, 0.05)
-    model, x = rigid_body(VEHICLE, 0.05, inputs=Inputs.SPEED, thrust_scale=0.8), np.zeros(N_BODY)
+    model = rigid_body(VEHICLE, 0.05, inputs=Inputs.SPEED, thrust_scale=0.8)
+    x = np.zeros(N_BODY)
     x[3] = 1.0
     for k in range(80):
-        state = np.zeros(N_STATES)
-        state[POSITIONS], state[VELOCITIES] = x[P], x[V]
         now = StepInputs(time=0.05 * k, attitude=x[Q].copy(), body_rates=x[W].copy())
-        command = controller.step(now, state, np.zeros((20, 4)))
+        command = controller.step(now, measured(x), np.zeros((20, 4)))
         x = advance_nodes(model, x, command.speeds / VEHICLE.speed_max)
     assert abs(x[2]) < 2e-3
     np.testing.assert_allclose(command.speeds, VEHICLE.hover_speed / math.sqrt(0.8), rtol=1e-3)
@@ -306,7 +342,7 @@ def test_it_predicts_its_own_flight() -> None:
     np.testing.assert_allclose(predicted[0, ANGLE_RATES], states[-1, W], atol=5e-3)
 
 
-def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
+def test_it_takes_over_from_a_controller_of_rotors_without_a_jump() -> None:
     rotors = build(Nonlinear(offset_free=ObserverSettings()), VEHICLE, 0.02)
     rotors.law.learn(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
     rotors.step(StepInputs(), np.zeros(N_STATES), np.zeros((rotors.horizon, 4)))
@@ -347,19 +383,18 @@ def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> Non
 
 
 def test_upside_down_it_comes_back_though_its_steps_do_not_converge() -> None:
-    """Each period starts from the cheaper rollout: of the last plan, or of a geometric law."""
+    """Each period starts from the cheaper rollout: of the last plan, or of geometric control."""
     controller = build(table(horizon=20, node=0.05, fallback=FallbackSettings(enabled=False)), VEHICLE, 0.05)
-    model, x = model_of(0.05), np.zeros(N_BODY + 1)
-    x[4], x[N_BODY] = 1.0, 1.0
+    model = model_of(0.05)
+    x = np.zeros(N_BODY + 1)
+    x[4] = 1.0  # half a turn about body x
+    x[N_BODY] = 1.0
     unconverged = 0
     for k in range(80):
-        state = np.zeros(N_STATES)
-        state[POSITIONS], state[VELOCITIES] = x[P], x[V]
-        given = StepInputs(time=0.05 * k, attitude=x[Q], body_rates=x[W])
-        command = controller.step(given, state, np.zeros((controller.horizon, 4)))
+        now = StepInputs(time=0.05 * k, attitude=x[Q], body_rates=x[W])
+        command = controller.step(now, measured(x), np.zeros((controller.horizon, 4)))
         unconverged += command.status == NOT_CONVERGED
-        x = advance_nodes(model, x, command.speeds / model.scale)
-        x[Q] /= np.linalg.norm(x[Q])
+        x = normalised(advance_nodes(model, x, command.speeds / model.scale))
     assert unconverged > 0
     assert np.linalg.norm(x[P]) < 0.05
     assert thrust_axis(x[Q])[2] > 0.999
@@ -373,8 +408,9 @@ def test_upside_down_it_comes_back_though_its_steps_do_not_converge() -> None:
 @pytest.mark.parametrize("lag", [LAG, (0.072, 0.072, 0.072, 0.15), (0.0, 0.0, 0.0, 0.0)])
 def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tuple[float, ...]) -> None:
     model = target_model(VEHICLE, period, lag)
-    law = HoverGain.of_model(model)
-    assert np.abs(np.linalg.eigvals(model.A - model.B @ np.linalg.solve(law.slope, law.gain))).max() < 1.0
+    hover = HoverGain.of_model(model)
+    closed_loop = model.A - model.B @ np.linalg.solve(hover.slope, hover.gain)
+    assert np.abs(np.linalg.eigvals(closed_loop)).max() < 1.0
     made = build(table(inner_lag=lag, horizon=1, node=None), VEHICLE, period)
     made.law.step = _fails  # type: ignore[attr-defined]
     x = at_rest()
@@ -404,10 +440,13 @@ def _fails(*_: object) -> Command:
 
 
 def test_the_target_model_is_that_of_small_motions() -> None:
-    model, x = target_model(VEHICLE, 0.02, LAG), at_rest()
+    model = target_model(VEHICLE, 0.02, LAG)
     states = 1e-4 * np.random.default_rng(5).normal(size=N_STATES)
-    x[P], x[V], x[W] = states[POSITIONS], states[VELOCITIES], states[ANGLE_RATES]
+    x = at_rest()
+    x[P] = states[POSITIONS]
+    x[V] = states[VELOCITIES]
     x[Q] = euler_to_quaternion(states[ANGLES])
+    x[W] = states[ANGLE_RATES]
     u = LEVEL + np.array([0.0, 1e-4, -2e-4, 3e-4])
     end = advance_nodes(model_of(0.02, substeps=20), x, u / model_of().scale)
     expected = model.A @ states + model.B @ (u - model.u_bar)
@@ -454,7 +493,7 @@ def test_bounds_on_thrust_hold_the_weight(thrust: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("ratio", [1.1, 1.5, 3.5, 14.0])
-def test_default_bounds_on_thrust_leave_room_around_the_weight(ratio: float) -> None:
+def test_default_bounds_on_thrust_are_on_both_sides_of_the_weight(ratio: float) -> None:
     weight = VEHICLE.mass * VEHICLE.gravity
     speed = math.sqrt(ratio * weight / (4.0 * VEHICLE.thrust_coefficient))
     lower, upper = TargetBounds().audited(replace(VEHICLE, speed_max=speed))["thrust"]

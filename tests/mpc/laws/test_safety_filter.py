@@ -22,7 +22,8 @@ from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array
 
-HORIZON, PERIOD = 40, 0.05
+HORIZON = 40
+PERIOD = 0.05
 VEHICLE = Assembly(load_scenario("paper-constrained")).vehicle
 HOVER = np.full(4, VEHICLE.hover_speed)
 
@@ -72,7 +73,8 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
     assert command.status == "solved"
     assert np.abs(command.speeds - HOVER - wanted).max() > 0.1
     # The prediction of its plan keeps 5 deg, and stands still at the end.
-    model, x = filter_.problem.model, state.copy()
+    model = filter_.problem.model
+    x = state.copy()
     x[INDEX["yaw"]] = 0.0
     for speeds in command.plan:
         x = model.A @ x + model.B @ (speeds - HOVER)
@@ -99,7 +101,10 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
 
 def test_the_plan_of_one_period_is_one_of_the_next() -> None:
     """Without disturbances a filter that was feasible stays so, whatever is wanted."""
-    filter_, rng, state, acting = make_filter(), np.random.default_rng(0), np.zeros(12), HOVER
+    filter_ = make_filter()
+    rng = np.random.default_rng(0)
+    state = np.zeros(12)
+    acting = HOVER
     model = filter_.problem.model
     filter_.reset(acting)
     for k in range(60):
@@ -107,7 +112,8 @@ def test_the_plan_of_one_period_is_one_of_the_next() -> None:
         command = filter_.step(StepInputs(time=k * PERIOD, acting=acting), state, np.zeros((HORIZON, 4)))
         assert command.status in ("solved", UNCONSTRAINED)
         assert command.stats.slack < 1e-6
-        acting, yaw = command.speeds, state[INDEX["yaw"]]
+        acting = command.speeds
+        yaw = state[INDEX["yaw"]]
         turned = state.copy()
         turned[INDEX["yaw"]] = 0.0
         state = model.A @ turned + model.B @ (acting - HOVER)
@@ -141,7 +147,8 @@ def test_a_polytope_of_any_name_is_no_terminal_condition() -> None:
     """A row times a factor leaves the filter's answer, and its terminal condition, as they are."""
     plans = []
     for factor in (1.0, 1e-4, 64.0):
-        rows, upper = ((factor, 0.5 * factor),), (0.3 * factor,)
+        rows = ((factor, 0.5 * factor),)
+        upper = (0.3 * factor,)
         table = robust_table(
             horizon=HORIZON,
             input_bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 10.0)),

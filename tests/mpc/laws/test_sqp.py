@@ -75,7 +75,8 @@ def at_rest(q: Array | None = None) -> Array:
 def call(controller: NonlinearMPC, x: Array, time: float = 0.0, reference: Array | None = None) -> Command:
     """The answer at a state (13,)."""
     state = np.zeros(N_STATES)
-    state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+    state[POSITIONS] = x[P]
+    state[VELOCITIES] = x[V]
     preview = np.zeros((controller.horizon, 4)) if reference is None else reference
     return controller.step(StepInputs(time=time, attitude=x[Q], body_rates=x[W]), state, preview)
 
@@ -117,9 +118,11 @@ def checked(controller: NonlinearMPC, share: float = 1e-8) -> int:
 @pytest.mark.parametrize("case", MANY)
 def test_answers_are_optima(case: str) -> None:
     """Thrown states from small to far off, from a cold start and along a flight's warm ones."""
-    active, answered = 0, 0
+    active = 0
+    answered = 0
     for seed, size in itertools.product(range(3), (0.1, 0.5, 1.0)):
-        rng, controller = np.random.default_rng(seed), law(**MANY[case])
+        rng = np.random.default_rng(seed)
+        controller = law(**MANY[case])
         controller.reset(HOVER if controller.commands == "rotors" else np.array(controller.numbers.level))
         for k in range(3):
             command = call(controller, thrown(rng, size), k * PERIOD)
@@ -135,7 +138,9 @@ def test_answers_are_optima(case: str) -> None:
 @pytest.mark.parametrize("case", MANY)
 def test_answers_of_two_nodes_are_optima(case: str) -> None:
     """Where few rows fit into the responses' memory, which the other methods use as well."""
-    rng, controller, answered = np.random.default_rng(0), law(horizon=2, **MANY[case]), 0
+    rng = np.random.default_rng(0)
+    controller = law(horizon=2, **MANY[case])
+    answered = 0
     controller.reset(HOVER if controller.commands == "rotors" else np.array(controller.numbers.level))
     for k in range(8):
         if call(controller, thrown(rng, 1.0 if k % 2 else 0.1), k * PERIOD).status in ACCEPTED:
@@ -155,8 +160,10 @@ MANY_ACTIVE: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", MANY_ACTIVE)
 def test_many_active_rows_are_found_by_the_interior_point_method(case: str) -> None:
     """Metres off, the dual search alone would exchange rows hundreds of times, and give up at times."""
-    rng, controller = np.random.default_rng(0), law(horizon=40, **MANY_ACTIVE[case])
-    work, found = controller.struct.work, 0
+    rng = np.random.default_rng(0)
+    controller = law(horizon=40, **MANY_ACTIVE[case])
+    work = controller.struct.work
+    found = 0
     for k in range(12):
         x = at_rest()
         x[P] = 4.0 * rng.normal(size=3)
@@ -178,7 +185,8 @@ def test_half_spaces_are_rows_of_the_program() -> None:
             [pillar], radius=0.1, period=PERIOD, horizon=12, settings=Avoidance(), penalty=penalty,
             positions=(0, 1, 2), largest=True,
         )  # fmt: skip
-        controller, reference = law(space, tilt=20.0, soft=Soft(linear=1e3)), np.zeros((12, 4))
+        controller = law(space, tilt=20.0, soft=Soft(linear=1e3))
+        reference = np.zeros((12, 4))
         reference[:, 0] = 0.2
         start = at_rest()
         start[V] = 1.2, 0.0, 0.0
@@ -211,7 +219,8 @@ def test_bounds_that_differ_from_step_to_step_hold(case: str) -> None:
         upper[-1] = math.inf
     elif case == "at the first steps":
         upper[3:] = math.inf
-    controller, reference = below(ceiling(upper)), np.zeros((20, 4))
+    controller = below(ceiling(upper))
+    reference = np.zeros((20, 4))
     reference[:, 2] = 1.0
     for k in range(6):
         command = call(controller, at_rest(), 0.05 * k, reference)
@@ -257,7 +266,8 @@ def test_a_wrong_answer_of_the_core_is_refused(monkeypatch: pytest.MonkeyPatch) 
 
 def test_an_infeasible_program_is_refused_and_stated() -> None:
     """A hard bound on body rates, broken beyond what the rotors can do in a node."""
-    controller, spinning = law(body_rate=30.0), at_rest()
+    controller = law(body_rate=30.0)
+    spinning = at_rest()
     spinning[W] = 50.0, 0.0, 0.0
     command = call(controller, spinning)
     assert command.status == "primal_infeasible"
@@ -272,7 +282,8 @@ def test_an_infeasible_program_is_refused_and_stated() -> None:
 
 def test_bounds_of_inputs_alone_are_never_infeasible() -> None:
     """Far off, a plan may diverge so that its program is lost in rounding: then the search is given up."""
-    rng, statuses = np.random.default_rng(0), Counter[str]()
+    rng = np.random.default_rng(0)
+    statuses = Counter[str]()
     controller = NonlinearMPC(VEHICLE, period=0.1, settings=Nonlinear(horizon=10))
     for k in range(100):
         statuses[call(controller, thrown(rng, 10.0), 0.1 * k).status] += 1
@@ -282,9 +293,11 @@ def test_bounds_of_inputs_alone_are_never_infeasible() -> None:
 
 def test_infeasible_programs_have_no_solution_for_another_solver() -> None:
     """Beyond hard bounds, near and far: rows that only seem to exclude each other are no reason."""
-    backend, refused = DaqpDense(), 0
+    backend = DaqpDense()
+    refused = 0
     for settings in (MANY["polytopes"], MANY["drag"]):
-        rng, controller = np.random.default_rng(0), law(**settings)
+        rng = np.random.default_rng(0)
+        controller = law(**settings)
         for k in range(40):
             if call(controller, thrown(rng, 1.0 + k % 3), k * PERIOD).status != "primal_infeasible":
                 continue
@@ -308,9 +321,12 @@ def _period(query: Query) -> Period:
 
 def test_the_start_makes_no_difference() -> None:
     """A plan and active set of another state lead to the same optimum of the same program."""
-    rng, settings = np.random.default_rng(5), MANY["soft tilt and rates"]
+    rng = np.random.default_rng(5)
+    settings = MANY["soft tilt and rates"]
     for _ in range(10):
-        cold, warm, x = law(**settings), law(**settings), thrown(rng, 1.0)
+        cold = law(**settings)
+        warm = law(**settings)
+        x = thrown(rng, 1.0)
         for _ in range(2):
             call(warm, thrown(rng, 1.0))
         first = call(cold, x)
@@ -334,7 +350,8 @@ def test_steps_end_with_the_time_and_keep_the_plan(settings: dict[str, Any]) -> 
     assert [controller.struct.work.iterations for controller in (whole, three, limited)] == [8, 3, 3]
     np.testing.assert_array_equal(plans[1], plans[2])
     assert np.abs(plans[0] - plans[2]).max() > 0.0
-    again, same = limited.stored_plan, three.stored_plan
+    again = limited.stored_plan
+    same = three.stored_plan
     assert again is not None
     assert same is not None
     np.testing.assert_array_equal(again[0], same[0])

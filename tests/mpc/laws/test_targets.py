@@ -28,8 +28,10 @@ from quadsim.vehicle import Vehicle
 
 pytestmark = pytest.mark.slow("targets")
 
-PERIOD, STEP = 0.02, 0.005
-FAST, SLOW = (0.02, 0.035, 0.035, 0.1), (0.072, 0.037, 0.037, 0.06)
+PERIOD = 0.02
+STEP = 0.005
+FAST = (0.02, 0.035, 0.035, 0.1)
+SLOW = (0.072, 0.037, 0.037, 0.06)
 LAGS = pytest.mark.parametrize("lag", [FAST, SLOW], ids=["fast", "slow"])
 COMMANDS = pytest.mark.parametrize("commands", ["rates", "attitude"])
 AUTOPILOT = 7.0
@@ -64,9 +66,12 @@ def fly(
     force: Array | None = None,
 ) -> Flown:
     """A point mass whose thrust and body rates follow targets exponentially; `course` of time gives x, y, z, yaw."""
-    m, g = vehicle.mass, np.array([0.0, 0.0, vehicle.gravity])
-    attitude, acting = start or Rotation.identity(), np.array([m * vehicle.gravity, 0.0, 0.0, 0.0])
-    position, v = course(0.0)[:3].copy(), np.zeros(3) if velocity is None else velocity.copy()
+    m = vehicle.mass
+    g = np.array([0.0, 0.0, vehicle.gravity])
+    attitude = start or Rotation.identity()
+    acting = np.array([m * vehicle.gravity, 0.0, 0.0, 0.0])
+    position = course(0.0)[:3].copy()
+    v = np.zeros(3) if velocity is None else velocity.copy()
     law.reset(acting)
     left = np.exp(-STEP / np.array(lag))
     share = np.array(lag) / STEP * (1.0 - left)
@@ -75,7 +80,8 @@ def fly(
         time = k * PERIOD
         euler = attitude.as_euler("ZYX")[::-1]
         state = make_state(position=tuple(position), euler=tuple(euler))
-        state[list(VELOCITY)], state[list(EULER_RATE)] = v, body_to_euler_rates(euler, acting[1:])
+        state[list(VELOCITY)] = v
+        state[list(EULER_RATE)] = body_to_euler_rates(euler, acting[1:])
         reference = np.array([course(time + (i + 1) * PERIOD) for i in range(law.horizon)])
         now = StepInputs(time=time, attitude=np.roll(attitude.as_quat(), 1), body_rates=acting[1:])
         target = law.step(now, state, reference).speeds
@@ -91,7 +97,8 @@ def fly(
             half = Rotation.from_rotvec(0.5 * STEP * np.array(rates))
             attitude = attitude * half
             acceleration = scale * thrust / m * attitude.as_matrix()[:, 2] - g + (0.0 if force is None else force)
-            position, v = position + STEP * v + 0.5 * STEP**2 * acceleration, v + STEP * acceleration
+            position = position + STEP * v + 0.5 * STEP**2 * acceleration
+            v = v + STEP * acceleration
             attitude = attitude * half
     return Flown(*(np.array(column) for column in zip(*flown, strict=True)))
 
@@ -109,7 +116,8 @@ def at_hover(law: GeometricController, vehicle: Vehicle, lag: tuple[float, ...])
     """(12,) eigenvalues of the continuous loop at hover: rates follow with the lags, and thrust at once."""
     rest = np.zeros(3)
     target = Target(position=rest, velocity=rest, acceleration=rest, yaw=0.0, yaw_rate=0.0, yaw_acceleration=0.0)
-    none, h = Integrals(translation=rest, rotation=rest), 1e-5
+    none = Integrals(translation=rest, rotation=rest)
+    h = 1e-5
 
     def command(state: Array) -> Array:
         return law.targets(motion_of(state), target, none)[0]
@@ -151,7 +159,8 @@ def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
     ],
 )
 def test_it_recovers_from_30_degrees(vehicle: Vehicle, lag: tuple[float, ...], commands: str) -> None:
-    law, start = geometric(vehicle, lag, commands), Rotation.from_euler("ZX", [0.4, math.radians(30.0)])
+    law = geometric(vehicle, lag, commands)
+    start = Rotation.from_euler("ZX", [0.4, math.radians(30.0)])
     flown = fly(law, vehicle, at_rest, 200, lag=lag, start=start)
     away = np.linalg.norm(flown.position - at_rest(0.0)[:3], axis=1)
     assert flown.tilt[0] == pytest.approx(30.0)
@@ -232,7 +241,8 @@ def test_targets_stay_within_their_bounds_and_integrals_hold_there(vehicle: Vehi
 
 def test_the_commanded_attitude_is_that_in_the_middle_of_the_period(vehicle: Vehicle) -> None:
     """With feed-forward; on the circle it turns by half a period's rates more."""
-    state, rows = make_state(position=(2.0, 0.0, 1.0)), []
+    state = make_state(position=(2.0, 0.0, 1.0))
+    rows = []
     state[INDEX["vy"]] = 2.0
     for feedforward in (False, True):
         law = geometric(vehicle, FAST, "attitude", feedforward=feedforward)

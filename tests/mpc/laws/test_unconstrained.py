@@ -31,8 +31,10 @@ def test_gain_converges_to_the_lqr_with_the_horizon() -> None:
 
 def test_gain_equals_the_finite_horizon_riccati_recursion() -> None:
     problem = paper_problem("paper-unconstrained")
-    A, B = problem.model.A, problem.model.B
-    Q, R = problem.objective.Q_y, problem.objective.Q_u
+    A = problem.model.A
+    B = problem.model.B
+    Q = problem.objective.Q_y
+    R = problem.objective.Q_u
     P = Q
     for _ in range(problem.horizon):
         K = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)

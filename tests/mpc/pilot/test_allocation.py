@@ -22,7 +22,8 @@ SHARES = st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4).map(np.array)
 
 def box(name: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Bounds as slews leave them: around some command, within the rotors' range, sometimes without any width."""
-    vehicle, rng = VEHICLES[name], np.random.default_rng(seed)
+    vehicle = VEHICLES[name]
+    rng = np.random.default_rng(seed)
     before = rng.uniform(vehicle.speed_min, vehicle.speed_max, 4)
     width = rng.choice([0.0, 0.05, 0.5, 2.0]) * vehicle.hover_speed
     return tuple(np.clip(before + side * width, vehicle.speed_min, vehicle.speed_max) for side in (-1.0, 1.0))
@@ -35,7 +36,8 @@ def missed(allocation: Allocation, wrench: np.ndarray, speeds: np.ndarray) -> np
 
 @given(name=NAMES, shares=SHARES)
 def test_a_wrench_that_can_be_given_is(name: str, shares: np.ndarray) -> None:
-    vehicle, allocation = VEHICLES[name], ALLOCATIONS[name]
+    vehicle = VEHICLES[name]
+    allocation = ALLOCATIONS[name]
     speeds = shares * vehicle.speed_max
     answer = allocate(allocation, allocation.M @ speeds**2, np.zeros(4), np.full(4, vehicle.speed_max))
     np.testing.assert_allclose(answer**2, speeds**2, atol=1e-9 * vehicle.speed_max**2)
@@ -70,7 +72,8 @@ def test_for_any_demand_the_speeds_are_finite_and_within_bounds(name: str, seed:
 @pytest.mark.parametrize("name", sorted(VEHICLES))
 def test_torque_for_roll_goes_before_thrust_that_cannot_be_had(name: str) -> None:
     """More thrust than there is, or less than none: the collective moves to where the roll torque fits."""
-    vehicle, allocation = VEHICLES[name], ALLOCATIONS[name]
+    vehicle = VEHICLES[name]
+    allocation = ALLOCATIONS[name]
     bounds = np.zeros(4), np.full(4, vehicle.speed_max)
     for thrust in (20.0, -5.0):
         wrench = np.array([thrust, 0.5, 0.0, 0.0]) * allocation.scale
@@ -103,8 +106,10 @@ def test_where_roll_and_pitch_do_not_fit_it_is_the_weighted_least_squares(name: 
     answer = allocate(allocation, wrench, lower, upper)
     if np.abs(missed(allocation, wrench, answer)[:3]).max() < 1e-6:
         return  # it fits, at most with less yaw
-    weights, unit = np.array([30.0, 1000.0, 1000.0, 1.0]) / allocation.scale, float(upper.max()) ** 2
-    low, high = lower**2, np.maximum(upper**2, lower**2 + 1e-9 * unit)
+    weights = np.array([30.0, 1000.0, 1000.0, 1.0]) / allocation.scale
+    unit = float(upper.max()) ** 2
+    low = lower**2
+    high = np.maximum(upper**2, lower**2 + 1e-9 * unit)
     wrench[0] = np.clip(wrench[0], allocation.M[0] @ low, allocation.M[0] @ high)
     best = lsq_linear(
         weights[:, None] * allocation.M * unit, weights * wrench, (low / unit, high / unit), method="bvls", tol=1e-14

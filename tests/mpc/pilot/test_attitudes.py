@@ -25,7 +25,8 @@ from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 
 LAGS = (0.12, 0.1, 0.5)
-RATE_LAG, ATTITUDE_LAG = 0.035, 0.085
+RATE_LAG = 0.035
+ATTITUDE_LAG = 0.085
 CIRCLE: dict[str, Any] = {
     "control_period": 0.02,
     "duration": 6.0,

@@ -29,10 +29,13 @@ LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 def turn(vehicle: Vehicle, torque: Array, duration: float, cutoff: float = 30.0) -> tuple[Array, Array]:
     """Rates after a while of constant commands, with the inner loop and as the model has it; exact but for Euler."""
-    J, M = np.array(vehicle.inertia), vehicle.allocation
+    J = np.array(vehicle.inertia)
+    M = vehicle.allocation
     loop = TorqueIncrement(vehicle, INDISettings(cutoff=cutoff), ActuatorBounds.of_vehicle(vehicle))
     commanded = vehicle.hover_speed + np.array([1.0, -0.5, -0.5, 0.5])
-    rates, modelled, rotors = np.array([0.4, 0.2, -0.3]), np.array([0.4, 0.2, -0.3]), commanded
+    rates = np.array([0.4, 0.2, -0.3])
+    modelled = np.array([0.4, 0.2, -0.3])
+    rotors = commanded
     for k in range(round(duration / STEP)):
         rotors = loop.speeds(k * STEP, commanded, rates, rotors, LEVEL)
         for _ in range(20):
@@ -130,10 +133,14 @@ def test_a_command_that_is_no_number_is_refused(vehicle: Vehicle) -> None:
 
 def test_it_answers_as_its_equations_do(vehicle: Vehicle) -> None:
     """A torque tau(u) + y; y'' = omega^2 (missed - y) - 2 zeta omega y', implicit, with missed at the middle rates."""
-    rng, J, omega = np.random.default_rng(1), np.array(vehicle.inertia), 2.0 * math.pi * 30.0
+    rng = np.random.default_rng(1)
+    J = np.array(vehicle.inertia)
+    omega = 2.0 * math.pi * 30.0
     bounds = ActuatorBounds.of_vehicle(vehicle)
     loop = TorqueIncrement(vehicle, INDISettings(cutoff=30.0), bounds)
-    filtered, slope, last = np.zeros(3), np.zeros(3), None
+    filtered = np.zeros(3)
+    slope = np.zeros(3)
+    last = None
     for k in range(100):
         commanded, rotors = vehicle.hover_speed + rng.uniform(-10.0, 10.0, (2, 4))
         rates = rng.normal(size=3)

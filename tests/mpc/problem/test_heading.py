@@ -32,8 +32,10 @@ def test_the_matrix_of_a_turn_turns() -> None:
 
 def test_a_prediction_turns_with_its_heading(vehicle: Vehicle) -> None:
     """Pitched by as much, the model at yaw psi goes along psi as it goes along x at yaw zero."""
-    model, rng = hover_model(vehicle, 0.05), np.random.default_rng(1)
-    state, plan = rng.normal(size=(1, 12)), model.u_bar + rng.normal(size=(1, 5, 4))
+    model = hover_model(vehicle, 0.05)
+    rng = np.random.default_rng(1)
+    state = rng.normal(size=(1, 12))
+    plan = model.u_bar + rng.normal(size=(1, 5, 4))
     state[0, INDEX["yaw"]] = 0.0
     ahead = rollout(model, state, plan)
     turned = turn_horizontally(state, np.array([2.0]))
@@ -47,7 +49,8 @@ def test_a_prediction_turns_with_its_heading(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 def test_under_a_disturbance_it_is_anchored_where_the_vehicle_rests(vehicle: Vehicle, yaw: float) -> None:
     """There it stays; and a level vehicle at hover speed is pushed away as by the disturbance."""
-    model, push = hover_model(vehicle, 0.05), np.array([0.3, -0.2, 0.25])
+    model = hover_model(vehicle, 0.05)
+    push = np.array([0.3, -0.2, 0.25])
     disturbed = replace(
         nonlinear_model(vehicle, 0.05), acceleration=push, angular_acceleration=np.array([0.5, -0.3, 0.1])
     )

@@ -24,12 +24,15 @@ MUJOCO_ORDER = [0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11]
 def paper_dynamics(vehicle: Vehicle, state: Array, speeds: Array) -> Array:
     """The nonlinear model exactly as printed in Sec. 2.2."""
     _, vx, _, vy, _, vz, phi, p, theta, q, psi, r = state
-    b, d, L = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient), vehicle.arm_length
+    b = vehicle.thrust_coefficient
+    d = vehicle.drag_to_thrust * vehicle.thrust_coefficient
+    L = vehicle.arm_length
     w1, w2, w3, w4 = speeds**2
     U = b * (w1 + w2 + w3 + w4)
     tau = b * L * (w4 - w2), b * L * (w3 - w1), d * (w1 - w2 + w3 - w4)
     ixx, iyy, izz = vehicle.inertia
-    s, c = np.sin, np.cos
+    s = np.sin
+    c = np.cos
     ax = (c(psi) * s(theta) * c(phi) + s(psi) * s(phi)) * U / vehicle.mass
     ay = (s(psi) * s(theta) * c(phi) - s(phi) * c(psi)) * U / vehicle.mass
     az = -vehicle.gravity + c(theta) * c(phi) * U / vehicle.mass
@@ -48,27 +51,32 @@ def mujoco_transition(vehicle: Vehicle, timestep: float) -> tuple[Array, Array]:
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     data = mujoco.MjData(model)
     data.ctrl[:] = vehicle.thrusts(np.full(4, vehicle.hover_speed))
-    A, B = np.zeros((12, 12)), np.zeros((12, 4))
+    A = np.zeros((12, 12))
+    B = np.zeros((12, 4))
     mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
     A = A[np.ix_(MUJOCO_ORDER, MUJOCO_ORDER)]
     B = B[MUJOCO_ORDER] * 2.0 * vehicle.thrust_coefficient * vehicle.hover_speed  # thrust slope dT/dw = 2 b w
-    whole_A, whole_B = np.eye(12), np.zeros((12, 4))
+    whole_A = np.eye(12)
+    whole_B = np.zeros((12, 4))
     for _ in range(round(PERIOD / timestep)):
-        whole_A, whole_B = A @ whole_A, A @ whole_B + B
+        whole_A = A @ whole_A
+        whole_B = A @ whole_B + B
     return whole_A, whole_B
 
 
 def transition_difference(vehicle: Vehicle) -> float:
     """Largest difference of A and B from MuJoCo's, in the limit of a vanishing step (Richardson extrapolation)."""
     exact = hover_model(vehicle, PERIOD)
-    coarse, fine = mujoco_transition(vehicle, 1e-3), mujoco_transition(vehicle, 5e-4)
+    coarse = mujoco_transition(vehicle, 1e-3)
+    fine = mujoco_transition(vehicle, 5e-4)
     limits = (2.0 * two - one for one, two in zip(coarse, fine, strict=True))
     return float(max(np.abs(limit - part).max() for limit, part in zip(limits, (exact.A, exact.B), strict=True)))
 
 
 def test_jacobians_match_finite_differences_of_the_printed_model(vehicle: Vehicle) -> None:
     A, B = continuous_model(vehicle)
-    state, speeds = make_state(position=(3.0, -2.0, 10.0)), np.full(4, vehicle.hover_speed)
+    state = make_state(position=(3.0, -2.0, 10.0))
+    speeds = np.full(4, vehicle.hover_speed)
     h = 1e-6
     for i, column in enumerate(np.eye(12)):
         slope = (
@@ -90,16 +98,19 @@ def test_discretisation_is_exact_for_a_double_integrator() -> None:
 
 
 def test_two_half_periods_make_a_whole_one(vehicle: Vehicle) -> None:
-    whole, half = hover_model(vehicle, PERIOD), hover_model(vehicle, PERIOD / 2)
+    whole = hover_model(vehicle, PERIOD)
+    half = hover_model(vehicle, PERIOD / 2)
     np.testing.assert_allclose(half.A @ half.A, whole.A, atol=1e-13)
     np.testing.assert_allclose(half.A @ half.B + half.B, whole.B, atol=1e-13)
 
 
 def test_discretisation_is_the_limit_of_mujocos_transition_derivatives(vehicle: Vehicle) -> None:
     exact = hover_model(vehicle, PERIOD)
-    coarse, fine = mujoco_transition(vehicle, 1e-3), mujoco_transition(vehicle, 5e-4)
+    coarse = mujoco_transition(vehicle, 1e-3)
+    fine = mujoco_transition(vehicle, 5e-4)
     for one, two, reference in zip(coarse, fine, (exact.A, exact.B), strict=True):
-        error_one, error_two = np.abs(one - reference).max(), np.abs(two - reference).max()
+        error_one = np.abs(one - reference).max()
+        error_two = np.abs(two - reference).max()
         assert error_one < 2e-2
         assert error_two == pytest.approx(error_one / 2, rel=0.05)  # first order, as the integrator
     assert transition_difference(vehicle) < 1e-6  # 2 fine - coarse, in which the first order cancels
@@ -107,7 +118,8 @@ def test_discretisation_is_the_limit_of_mujocos_transition_derivatives(vehicle: 
 
 def test_discretisation_matches_central_differences_of_the_plant_itself(vehicle: Vehicle) -> None:
     exact = hover_model(vehicle, PERIOD)
-    hover, speeds = make_state(position=(0.0, 0.0, 10.0)), np.full(4, vehicle.hover_speed)
+    hover = make_state(position=(0.0, 0.0, 10.0))
+    speeds = np.full(4, vehicle.hover_speed)
     with Plant(vehicle) as plant:
 
         def after(state: Array, speeds: Array) -> Array:
@@ -128,7 +140,8 @@ def test_with_the_moment_it_matches_central_differences_of_the_plant_in_air(vehi
     moments = {"rotor_moment": (2e-4, -3e-4), "inflow_moment": (0.02, 0.03), "rate_damping": (0.02, 0.03, 0.01)}
     vehicle = replace(vehicle, **moments, inflow=4e-4)
     known, ignorant = (hover_model(vehicle, PERIOD, moment=moment) for moment in (True, False))
-    hover, speeds = make_state(position=(0.0, 0.0, 10.0)), np.full(4, vehicle.hover_speed)
+    hover = make_state(position=(0.0, 0.0, 10.0))
+    speeds = np.full(4, vehicle.hover_speed)
     effects = Effects(air=Air(**moments, inflow=4e-4))
     with Plant(vehicle, effects=effects, integrator="rk4") as plant:
 

@@ -31,8 +31,11 @@ def points(vehicle: Vehicle, count: int, *, lag: float | None, seed: int = 0) ->
     """States up to 60 deg of tilt in any direction, at any yaw, turning at up to 3 rad/s; and commands."""
     rng = np.random.default_rng(seed)
     x = 3.0 * rng.normal(size=(count, 12))
-    tilt, direction = np.radians(60.0) * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
-    x[:, 6], x[:, 8], x[:, 10] = tilt * np.cos(direction), tilt * np.sin(direction), rng.uniform(-np.pi, np.pi, count)
+    tilt = np.radians(60.0) * np.sqrt(rng.uniform(size=count))
+    direction = rng.uniform(-np.pi, np.pi, count)
+    x[:, 6] = tilt * np.cos(direction)
+    x[:, 8] = tilt * np.sin(direction)
+    x[:, 10] = rng.uniform(-np.pi, np.pi, count)
     x[:, EULER_RATE] = rng.uniform(-3.0, 3.0, (count, 3))
     around_hover = vehicle.hover_speed + rng.uniform(-30.0, 30.0, (2, count, 4))
     return x if lag is None else np.hstack([x, around_hover[0]]), around_hover[1]
@@ -40,7 +43,8 @@ def points(vehicle: Vehicle, count: int, *, lag: float | None, seed: int = 0) ->
 
 def disturbed(vehicle: Vehicle, lag: float | None, substeps: int = 2) -> NonlinearModel:
     model = nonlinear_model(vehicle, PERIOD, substeps=substeps, rotor_lag=lag)
-    push, turn = np.array([0.7, -0.4, 1.1]), np.array([-0.5, 0.8, 0.3])
+    push = np.array([0.7, -0.4, 1.1])
+    turn = np.array([-0.5, 0.8, 0.3])
     return replace(model, acceleration=push, angular_acceleration=turn)
 
 
@@ -51,7 +55,8 @@ def flown(vehicle: Vehicle, x: Array, u: Array, *, effects: Effects, timestep: f
         for i in range(len(x)):
             plant.reset(x[i, :12], x[i, 12:] if x.shape[1] > 12 else None)
             plant.advance(u[i], round(PERIOD / timestep))
-            after[i, :12], after[i, 12:] = plant.state(), plant.speeds
+            after[i, :12] = plant.state()
+            after[i, 12:] = plant.speeds
     return after
 
 
@@ -66,7 +71,8 @@ def test_derivative_is_that_of_a_rigid_body_at_any_attitude(vehicle: Vehicle) ->
     slope = derivative(model, x, u)
     wrench = np.square(u) @ vehicle.allocation.T
     inertia = np.array(vehicle.inertia)
-    euler, rates = x[:, EULER], x[:, EULER_RATE]
+    euler = x[:, EULER]
+    rates = x[:, EULER_RATE]
     omega = euler_to_body_rates(euler, rates)
     turning = (wrench[:, 1:] - np.cross(omega, inertia * omega)) / inertia + model.angular_acceleration
     h = 1e-5
@@ -101,7 +107,8 @@ def test_lag_is_that_of_the_plants_rotors(vehicle: Vehicle) -> None:
 
 
 def test_disturbance_is_the_plants(vehicle: Vehicle) -> None:
-    force, torque = (2.0, -1.0, 1.5), (0.02, -0.03, 0.01)
+    force = (2.0, -1.0, 1.5)
+    torque = (0.02, -0.03, 0.01)
     x, u = points(vehicle, 6, lag=None)
     model = replace(
         nonlinear_model(vehicle, PERIOD, substeps=16),
@@ -115,7 +122,8 @@ def test_disturbance_is_the_plants(vehicle: Vehicle) -> None:
 
 def test_at_hover_the_linear_model_is_left(vehicle: Vehicle) -> None:
     """There the Jacobian is nilpotent: Runge-Kutta's first four terms are the whole exponential."""
-    hover, speeds = make_state(position=(3.0, -2.0, 10.0)), np.full(4, vehicle.hover_speed)
+    hover = make_state(position=(3.0, -2.0, 10.0))
+    speeds = np.full(4, vehicle.hover_speed)
     A, B, c = linearised(nonlinear_model(vehicle, PERIOD, substeps=1), hover, speeds)
     exact = hover_model(vehicle, PERIOD)
     np.testing.assert_allclose(A, exact.A, atol=1e-8)
@@ -164,7 +172,8 @@ def test_c_predicts_the_same(vehicle: Vehicle, lag: float | None, share: float, 
     """To the instant a known delay later, at any attitude, with the disturbance that is estimated."""
     settings = robust_table(rotor_lag=lag or 0.0, delay=share * PERIOD, offset_free=ObserverSettings())
     preparation = RobustPreparation(vehicle, settings.problem(vehicle, PERIOD), settings)
-    model, disturbance = nonlinear_model(vehicle, PERIOD, rotor_lag=lag), ESTIMATES[estimate]
+    model = nonlinear_model(vehicle, PERIOD, rotor_lag=lag)
+    disturbance = ESTIMATES[estimate]
     x, u = points(vehicle, 20, lag=lag)
     for state, command in zip(x, u, strict=True):
         before = state[12:] if lag else command

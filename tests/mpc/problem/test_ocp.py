@@ -188,7 +188,10 @@ def test_a_row_of_outputs_has_the_name_of_a_state_where_it_is_one() -> None:
     bounds = paper_problem().bounds
     assert bounds is not None
     C_c = np.zeros((4, 12))
-    C_c[0, 6], C_c[1, 6], C_c[2, [6, 8]], C_c[3, 5] = 1.0, 2.0, 1.0, 1.0
+    C_c[0, 6] = 1.0
+    C_c[1, 6] = 2.0
+    C_c[2, [6, 8]] = 1.0
+    C_c[3, 5] = 1.0
     rows = [replace(bounds, C_c=C_c, y_min=np.full(4, -1.0), y_max=np.ones(4)).output(i) for i in range(4)]
     assert [row.name for row in rows] == ["roll", "row 1 of C_c", "row 2 of C_c", "vz"]
     assert [row.field for row in rows] == ["controller.output_bounds.roll", "", "", "controller.output_bounds.vz"]
@@ -196,7 +199,8 @@ def test_a_row_of_outputs_has_the_name_of_a_state_where_it_is_one() -> None:
 
 
 def test_a_side_of_a_bound_is_an_entry_of_the_file() -> None:
-    pair, listed = Origin("roll", field="controller.output_bounds.roll"), Origin("p", field="controller.p", row=2)
+    pair = Origin("roll", field="controller.output_bounds.roll")
+    listed = Origin("p", field="controller.p", row=2)
     assert [pair.place(upper=upper)[1] for upper in (False, True)] == [0, 1]
     assert [listed.place(upper=upper) for upper in (False, True)] == [
         ("controller.p.lower", 2),

@@ -36,7 +36,8 @@ def test_stacked_prediction_equals_the_recursion(horizon: int) -> None:
     rng = np.random.default_rng(horizon)
     model = random_problem(rng, horizon=horizon).model
     maps = prediction(model, horizon)
-    state, plan = rng.normal(size=3), rng.normal(size=(horizon, 2))
+    state = rng.normal(size=3)
+    plan = rng.normal(size=(horizon, 2))
     stacked = maps.Phi @ state + maps.Psi @ (plan - model.u_bar).ravel()
     np.testing.assert_allclose(stacked.reshape(horizon, 3), rollout(model, state[None], plan[None])[0], atol=1e-12)
 
@@ -62,10 +63,12 @@ def test_prediction_error_near_hover_falls_quadratically(vehicle: Vehicle, steps
 
 def eq_5(problem: Problem, state: Array, plan: Array, desired: Array) -> float:
     """The cost as printed, summed step by step."""
-    objective, u_bar = problem.objective, problem.model.u_bar
+    objective = problem.objective
+    u_bar = problem.model.u_bar
     total = 0.0
     for xi, u, y_d in zip(rollout(problem.model, state[None], plan[None])[0], plan, desired, strict=True):
-        error, effort = objective.C_r @ xi - y_d, u - u_bar
+        error = objective.C_r @ xi - y_d
+        effort = u - u_bar
         total += error @ objective.Q_y @ error + effort @ objective.Q_u @ effort
     return float(total)
 
@@ -75,7 +78,8 @@ def test_condensed_cost_differs_from_eq_5_by_a_constant(horizon: int) -> None:
     rng = np.random.default_rng(horizon)
     problem = random_problem(rng, horizon=horizon)
     terms = cost(prediction(problem.model, horizon), problem.objective)
-    state, desired = rng.normal(size=3), rng.normal(size=(horizon, 3))
+    state = rng.normal(size=3)
+    desired = rng.normal(size=(horizon, 3))
     gradient = terms.gradient(state, desired, problem.model.u_bar)
     differences = []
     for _ in range(5):
@@ -119,11 +123,15 @@ def test_rows_are_the_printed_inequalities(horizon: int) -> None:
     """A_ineq u <= G1 xi(k) + G2 u(k-1) + G3, with the offset of the linearisation.  Eqs. (14), (16)-(19)."""
     rng = np.random.default_rng(horizon)
     problem = random_problem(rng, horizon=horizon, n_c=2)
-    bounds, model = problem.bounds, problem.model
+    bounds = problem.bounds
+    model = problem.model
     assert bounds is not None
-    state, before, plan = rng.normal(size=3), rng.normal(size=2), rng.normal(size=(horizon, 2))
+    state = rng.normal(size=3)
+    before = rng.normal(size=2)
+    plan = rng.normal(size=(horizon, 2))
     qp = Condensed(problem).assemble(Query(state, np.zeros((horizon, problem.objective.C_r.shape[0])), before))
-    maps, steps = prediction(model, horizon), slew_matrix(horizon, 2)
+    maps = prediction(model, horizon)
+    steps = slew_matrix(horizon, 2)
     of_outputs = np.kron(np.eye(horizon), bounds.C_c)
     first = np.concatenate([before, np.zeros(2 * (horizon - 1))])
     outputs = of_outputs @ (maps.Phi @ state + maps.Psi @ (plan - model.u_bar).ravel())
@@ -137,5 +145,6 @@ def test_rows_are_the_printed_inequalities(horizon: int) -> None:
     scale = np.tile(problem.rows.scale[QPRows(problem).origin], horizon)
     values = qp.G @ plan.ravel()
     ours = np.concatenate([qp.h_u - values, values - qp.h_l]) / np.tile(scale, 2)
-    ours, printed = np.sort(ours[np.isfinite(ours)]), np.sort(np.concatenate(slack))
+    ours = np.sort(ours[np.isfinite(ours)])
+    printed = np.sort(np.concatenate(slack))
     np.testing.assert_allclose(ours, printed, atol=1e-12)

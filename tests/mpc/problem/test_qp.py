@@ -27,7 +27,8 @@ STATE[10] = np.pi / 6
 @pytest.mark.parametrize("name", ["piqp-multistage", "piqp-dense", "daqp"])
 def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: str) -> None:
     problem = paper_problem()
-    formulation, backend = SOLVERS[name].formulate(problem), make_backend(name)
+    formulation = SOLVERS[name].formulate(problem)
+    backend = make_backend(name)
     backend.setup(formulation.qp)
     active = 0
     for query in flight_queries(constrained_flight, problem, stride=40):
@@ -55,7 +56,8 @@ def at(solution: Solution, **parts: Array) -> Solution:
 
 def test_kkt_residuals_see_every_kind_of_fault() -> None:
     problem = paper_problem()
-    formulation, backend = Condensed(problem), Piqp(dense=True)
+    formulation = Condensed(problem)
+    backend = Piqp(dense=True)
     query = (STATE, problem.desired(paper_reference(60)[1:51]), problem.model.u_bar)
     qp, solution = solved(formulation, backend, query)
     assert kkt_residuals(qp, solution).worst < 1e-3
@@ -87,7 +89,8 @@ def test_a_problem_without_bounds_needs_no_qp(build: object) -> None:
 def test_first_inputs_are_exact_over_the_flight(constrained_flight: Flight) -> None:
     """Within 1e-3 rad/s of an active-set solver's, which ends at a vertex and not near one."""
     problem = paper_problem()
-    ours, exact = QPSolver("piqp-multistage", problem), QPSolver("daqp", problem)
+    ours = QPSolver("piqp-multistage", problem)
+    exact = QPSolver("daqp", problem)
     queries = flight_queries(constrained_flight, problem, stride=15)
     errors = [np.abs(ours.solve(Query(*query)).plan[0] - exact.solve(Query(*query)).plan[0]).max() for query in queries]
     assert max(errors) < 1e-3
@@ -102,7 +105,8 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     tighter = Constraint(name="late", D=np.eye(4), lower=np.full((15, 4), -1.0), upper=late)
     problem = replace(problem, constraints=(again, tighter))
     desired = problem.desired(np.tile([0.0, 0.0, 30.0, 0.0], (15, 1)))
-    form, backend = Condensed(problem), Piqp(dense=True)
+    form = Condensed(problem)
+    backend = Piqp(dense=True)
     qp, solution = solved(form, backend, (np.zeros(12), desired, problem.model.u_bar))
     optimum = polish(qp, solution)
     assert kkt_residuals(qp, optimum).worst < 1e-5
@@ -121,7 +125,8 @@ def test_a_slack_has_the_multiplier_that_makes_its_gradient_zero() -> None:
     assert problem.bounds is not None
     penalty = Penalty(l1=np.array([3.0]), l2=np.array([2.0]))
     form = Condensed(replace(problem, bounds=replace(problem.bounds, penalty=penalty)))
-    multipliers, slacks = np.zeros((4, len(problem.rows.D))), np.array([[0.0], [1.0], [1.0], [1.0]])
+    multipliers = np.zeros((4, len(problem.rows.D)))
+    slacks = np.array([[0.0], [1.0], [1.0], [1.0]])
     multipliers[:, 0] = [-2.0, 0.0, 5.0, 7.0]
     solution = form.solution(np.zeros((4, 2)), slacks, multipliers)
     scale = form.qp.c[8:] / 3.0  # l1 per unit of the QP's slack over that per unit of the row

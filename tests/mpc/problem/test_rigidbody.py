@@ -87,8 +87,10 @@ def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
     plain, inputs, same = linearise_nodes(model, x, u)
     np.testing.assert_array_equal(end, same)
     for i in range(3):
-        before, after = np.eye(model.n), np.eye(model.n)
-        before[Q, Q], after[Q, Q] = frame(frames[i]), frame(frames[i + 1])
+        before = np.eye(model.n)
+        after = np.eye(model.n)
+        before[Q, Q] = frame(frames[i])
+        after[Q, Q] = frame(frames[i + 1])
         np.testing.assert_allclose(A[i], after @ plain[i] @ before.T, atol=1e-12)
         np.testing.assert_allclose(B[i], after @ inputs[i], atol=1e-12)
 
@@ -141,7 +143,9 @@ def test_it_moves_as_the_model_in_euler_angles() -> None:
     speeds = VEHICLE.hover_speed + 5.0 * rng.normal(size=(5, 4))
     model = rigid_body(VEHICLE, 1e-4, inputs=Inputs.SPEED)
     x = np.empty((5, N_BODY))
-    x[:, P], x[:, V], x[:, Q] = state[:, POSITIONS], state[:, VELOCITIES], euler_to_quaternion(state[:, ANGLES])
+    x[:, P] = state[:, POSITIONS]
+    x[:, V] = state[:, VELOCITIES]
+    x[:, Q] = euler_to_quaternion(state[:, ANGLES])
     x[:, W] = euler_to_body_rates(state[:, ANGLES], state[:, ANGLE_RATES])
     moved = (advance_nodes(model, x, speeds / VEHICLE.speed_max) - x) / model.step
     expected = derivative(nonlinear_model(VEHICLE, 0.05), state, speeds)
@@ -154,7 +158,8 @@ def test_it_moves_as_the_model_in_euler_angles() -> None:
 def test_a_spin_about_an_axis_keeps_its_rate_and_turns_by_it() -> None:
     model = rigid_body(VEHICLE, 0.05, substeps=4)
     x = np.zeros(N_BODY)
-    x[3], x[12] = 1.0, 2.0
+    x[3] = 1.0
+    x[12] = 2.0
     hover = np.full(4, VEHICLE.mass * VEHICLE.gravity / 4.0)
     for _ in range(10):
         x = advance_nodes(model, x, model.shares(hover))

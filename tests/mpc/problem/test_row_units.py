@@ -24,7 +24,8 @@ FACTORS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-2, 1e2, 1e4, 1e8)
 HORIZON = 12
 CLIMB = 30.0
 """Desired height [m], out of reach."""
-LINEAR, QUADRATIC = 2e3, 1e2
+LINEAR = 2e3
+QUADRATIC = 1e2
 """Penalty of violating the soft row by 1 m."""
 
 
@@ -32,7 +33,8 @@ def problem_with(factor: float, *, soft: bool) -> Problem:
     """The paper's problem with two rows times a factor: height and climb, and the sum of rotor speeds."""
     problem = paper_problem("paper-constrained", f"controller.horizon={HORIZON}")
     C = np.zeros((1, 12))
-    C[0, INDEX["z"]], C[0, INDEX["vz"]] = 1.0, 0.3
+    C[0, INDEX["z"]] = 1.0
+    C[0, INDEX["vz"]] = 0.3
     penalty = Penalty(l1=np.array([LINEAR / factor]), l2=np.array([QUADRATIC / factor**2])) if soft else None
     top = -0.02 if soft else 0.1
     none = np.full(1, -np.inf)
@@ -88,7 +90,8 @@ def test_a_power_of_two_changes_no_bit(name: str, factor: float) -> None:
 def test_a_violation_counts_alike_in_every_unit(factor: float) -> None:
     """A plan that leaves the row by 5 cm is refused, whatever the row's unit."""
     problem = problem_with(factor, soft=False)
-    query, check = query_of(problem), AnswerCheck(problem, 1)
+    query = query_of(problem)
+    check = AnswerCheck(problem, 1)
     answer = make_solver("piqp", problem).solve(query)
     assert check(problem, query, answer, None)[1] is None
     without = replace(problem, constraints=())

@@ -35,7 +35,10 @@ def without_bounds(problem: Problem) -> Problem:
 
 def gain(problem: Problem) -> Array:
     """K (nu, n) of the infinite horizon, by iterating the Riccati difference equation."""
-    A, B, Q, R = problem.model.A, problem.model.B, problem.objective.weights[0], problem.objective.Q_u
+    A = problem.model.A
+    B = problem.model.B
+    Q = problem.objective.weights[0]
+    R = problem.objective.Q_u
     P = Q
     for _ in range(20_000):
         K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
@@ -69,7 +72,8 @@ def test_the_first_input_is_the_infinite_horizons(horizon: int, elsewhere: bool)
         rng = np.random.default_rng(seed)
         problem = terminated(without_bounds(random_problem(rng, horizon=horizon, n=4, nu=2, n_c=2)))
         rest = Equilibrium(rng.normal(size=4), rng.normal(size=2)) if elsewhere else problem.equilibrium
-        state, desired = rest.x + rng.normal(size=4), np.tile(rest.x, (horizon, 1))
+        state = rest.x + rng.normal(size=4)
+        desired = np.tile(rest.x, (horizon, 1))
         expected = rest.u - gain(problem) @ (state - rest.x)
         for name, result in first_inputs(problem, (state, desired, problem.model.u_bar, rest)).items():
             np.testing.assert_allclose(result, expected, atol=1e-8 * max(1.0, np.abs(expected).max()), err_msg=name)
@@ -79,7 +83,8 @@ def test_the_first_input_is_the_infinite_horizons(horizon: int, elsewhere: bool)
 def test_the_papers_vehicle_flies_to_a_set_point_as_by_the_infinite_horizons_law(horizon: int) -> None:
     """Outputs are four of twelve states; rest may be tilted, as against wind, which is no error of the last state."""
     problem = terminated(without_bounds(paper_problem("paper-constrained", f"controller.horizon={horizon}")))
-    K, u_bar = gain(problem), problem.model.u_bar
+    K = gain(problem)
+    u_bar = problem.model.u_bar
     state = 0.01 * np.random.default_rng(0).normal(size=12)
     reference = np.array([0.3, -0.2, 0.5, 0.1])
     goal = np.zeros(12)
@@ -104,7 +109,9 @@ def test_without_it_a_short_horizon_is_not_infinite() -> None:
 
 def test_it_equals_the_cost_to_come_to_rest() -> None:
     problem = random_problem(np.random.default_rng(4), horizon=3)
-    P, K, model = lqr_terminal_weight(problem.model, problem.objective), gain(problem), problem.model
+    P = lqr_terminal_weight(problem.model, problem.objective)
+    K = gain(problem)
+    model = problem.model
     closed = model.A - model.B @ K
     spent = scipy.linalg.solve_discrete_lyapunov(
         closed.T, problem.objective.weights[0] + K.T @ problem.objective.Q_u @ K
@@ -116,7 +123,8 @@ def test_it_equals_the_cost_to_come_to_rest() -> None:
 def test_the_axes_of_a_quadrotor_stay_apart() -> None:
     """Rounding in the Riccati equation's solution ties none of them."""
     problem = paper_problem()
-    result, with_weight = axes(problem), axes(terminated(problem))
+    result = axes(problem)
+    with_weight = axes(terminated(problem))
     assert [axis.states.tolist() for axis in with_weight] == [axis.states.tolist() for axis in result]
     assert len(result) == 4
 
@@ -130,7 +138,8 @@ def test_a_state_that_costs_nothing_and_does_not_come_to_rest_is_refused(weights
 
 def test_an_uncontrollable_unstable_state_is_refused() -> None:
     problem = random_problem(np.random.default_rng(0), horizon=3)
-    A, B = np.diag([1.1, 0.5, 0.5]), problem.model.B.copy()
+    A = np.diag([1.1, 0.5, 0.5])
+    B = problem.model.B.copy()
     B[0] = 0.0
     objective = Objective(C_r=np.eye(3), Q_y=np.eye(3), Q_u=np.eye(2))
     with pytest.raises(ParameterError, match=r"controller\.terminal"):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from numpy_preparation import next_state, nonlinear_model
-from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc, robust_table
+from support import derivative, paper_problem, paper_reference, robust_mpc, robust_table
 
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
@@ -32,8 +32,10 @@ from quadsim.mpc.problem.tightening import (
     margins,
 )
 from quadsim.mpc.tables.commands import InputWeights
+from quadsim.rollout.rollout import closed_loop
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
+from quadsim.sim.loop import complete
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -119,14 +121,16 @@ def errors(vehicle: Vehicle, w: Array, *, rotor_lag: float, delay: float, subste
     late = round(delay / step)
     A_d, inputs = discretise(A, np.hstack([B, E]), step)
     ideal = np.split(inputs, [4], axis=1)[0]
-    e, acting = np.zeros((len(A), w.shape[2])), np.zeros((4, w.shape[2]))
+    e = np.zeros((len(A), w.shape[2]))
+    acting = np.zeros((4, w.shape[2]))
     under_way = [acting] * (late // substeps)
     outputs = np.empty((len(w), 2, w.shape[2]))
     for i, pushed in enumerate(w):
         if (i - late) % substeps == 0 and under_way:
             acting = under_way.pop(0)
         if i % substeps == 0:
-            predicted, coming = e, [acting, *under_way]
+            predicted = e
+            coming = [acting, *under_way]
             for j in range(late):
                 predicted = A_d @ predicted + ideal @ coming[(j + i - late) // substeps - (i - late) // substeps]
             under_way.append(-K @ predicted)
@@ -139,7 +143,10 @@ def errors(vehicle: Vehicle, w: Array, *, rotor_lag: float, delay: float, subste
 
 @pytest.mark.parametrize(("rotor_lag", "delay"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.02), (0.05, 0.05), (0.05, 0.12)])
 def test_margins_equal_the_worst_disturbances_effect(vehicle: Vehicle, rotor_lag: float, delay: float) -> None:
-    largest, substeps, periods, about_x = np.repeat([0.5, 0.3], 3), 50, 10, 3
+    largest = np.repeat([0.5, 0.3], 3)
+    substeps = 50
+    periods = 10
+    about_x = 3
     settings = TighteningSettings(acceleration=0.5, angular_acceleration=0.3, turning=0.0)
     result = tilt_margins(vehicle, settings, rotor_lag=rotor_lag, delay=delay)
     late = round(delay / PERIOD * substeps)
@@ -199,7 +206,8 @@ def test_an_estimate_may_be_wrong_by_twice_the_disturbance(vehicle: Vehicle) -> 
 
 
 def test_wind_draws_in_bounds_of_velocity_and_not_those_of_tilt(vehicle: Vehicle) -> None:
-    still, windy = TighteningSettings(acceleration=0.0), TighteningSettings(acceleration=1.0)
+    still = TighteningSettings(acceleration=0.0)
+    windy = TighteningSettings(acceleration=1.0)
     np.testing.assert_allclose(tilt_margins(vehicle, windy), tilt_margins(vehicle, still), rtol=1e-9)
     velocity = np.zeros((1, 12))
     velocity[0, INDEX["vx"]] = 1.0
@@ -230,7 +238,8 @@ def test_outputs_observe_no_more_than_their_own_chain(
 
 def test_disturbed_model_is_the_derivative_of_the_nonlinear_one_at_hover(vehicle: Vehicle) -> None:
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
-    x, u = np.concatenate([np.zeros(12), np.full(4, vehicle.hover_speed)]), np.full(4, vehicle.hover_speed)
+    x = np.concatenate([np.zeros(12), np.full(4, vehicle.hover_speed)])
+    u = np.full(4, vehicle.hover_speed)
     A, B, E = disturbed_model(vehicle, 0.03)
     h = 1e-4
 
@@ -317,9 +326,12 @@ def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float
     scenario = load_scenario("paper-constrained", ["duration=13.5", *sets])
     drawn_in = tilt_margins(vehicle, rotor_lag=rotor_lag, estimated=True) if tight else None
     controller = robust(vehicle, drawn_in, rotor_lag=rotor_lag)
-    reference = Assembly(scenario).reference(scenario.periods + HORIZON)
-    with Assembly(scenario).plant() as plant:
-        log = fly_once(scenario, plant, controller, reference, navigation=None)
+    assembly = Assembly(scenario)
+    reference = assembly.reference(scenario.periods + HORIZON)
+    with assembly.plant() as plant:
+        loop = closed_loop(assembly, plant, controller, reference, navigation=None)
+        complete(loop, periods=scenario.periods)
+        log = loop.log()
     assert log.reason is None
     assert len(log.plant.t) > 13_499  # each physics step
     tilts = np.abs(log.plant.state[:, [INDEX["roll"], INDEX["pitch"]]])
@@ -379,9 +391,11 @@ def pushed_tilt(vehicle: Vehicle, course: Course, *, rotor_lag: float, delay: fl
     drawn_in = tilt_margins(vehicle, rotor_lag=rotor_lag, delay=delay, estimated=estimated)
     controller = robust(vehicle, drawn_in, rotor_lag=rotor_lag, delay=delay)
     plant = nonlinear_model(vehicle, PERIOD / substeps, substeps=1, rotor_lag=rotor_lag or None)
-    reference, acting = paper_reference(120 + HORIZON), np.full(4, vehicle.hover_speed)
+    reference = paper_reference(120 + HORIZON)
+    acting = np.full(4, vehicle.hover_speed)
     controller.reset(acting)
-    x, peak = np.concatenate([np.zeros(12), acting])[: plant.n], 0.0
+    x = np.concatenate([np.zeros(12), acting])[: plant.n]
+    peak = 0.0
     for k in range(120):
         command = controller.step(
             StepInputs(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + HORIZON]
@@ -397,7 +411,8 @@ def pushed_tilt(vehicle: Vehicle, course: Course, *, rotor_lag: float, delay: fl
     return peak
 
 
-TURNS, ALL = alternating(3.0, 0.0), alternating(6.0, STATED.acceleration)
+TURNS = alternating(3.0, 0.0)
+ALL = alternating(6.0, STATED.acceleration)
 
 
 @pytest.mark.slow("tightening")

@@ -73,7 +73,8 @@ def test_whatever_ties_two_states_ties_their_axes(tie: str) -> None:
         Q_y[0, 1] = Q_y[1, 0] = 1e-3
         problem = replace(problem, objective=replace(problem.objective, Q_y=Q_y))
     elif tie == "C_r":  # rows whose product with the weights is the identity all the same
-        C_r, Q_y = problem.objective.C_r.copy(), problem.objective.Q_y.copy()
+        C_r = problem.objective.C_r.copy()
+        Q_y = problem.objective.Q_y.copy()
         C_r[0, [x, y]] = 1.0
         Q_y[:2, :2] = [[1.0, -1.0], [-1.0, 2.0]]
         problem = replace(problem, objective=replace(problem.objective, C_r=C_r, Q_y=Q_y))
@@ -128,7 +129,9 @@ def test_an_empty_row_prevents_separation() -> None:
 
 def cost(problem: Problem, state: Array, desired: Array, moves: Array) -> float:
     """Eq. (5), by recursion, of moves u - u_bar (N, nu)."""
-    model, objective, total = problem.model, problem.objective, 0.0
+    model = problem.model
+    objective = problem.objective
+    total = 0.0
     for move, wanted in zip(moves, desired, strict=True):
         state = model.A @ state + model.B @ move
         error = objective.C_r @ state - wanted
@@ -143,10 +146,13 @@ def test_costs_and_outputs_fall_apart() -> None:
     assert problem.bounds is not None
     result = axes(problem)
     assert sorted(axis.states.size for axis in result) == [2, 2, 3]
-    state, desired, moves = rng.normal(size=7), rng.normal(size=(5, 7)), rng.normal(size=(5, 4))
+    state = rng.normal(size=7)
+    desired = rng.normal(size=(5, 7))
+    moves = rng.normal(size=(5, 4))
     for axis in result:
         own = (axis.problem, state[axis.states], desired[:, axis.regulated])
-        w, change = moves @ inverse(problem, axis).T, rng.normal(size=(5, axis.T.shape[1]))
+        w = moves @ inverse(problem, axis).T
+        change = rng.normal(size=(5, axis.T.shape[1]))
         whole = cost(problem, state, desired, moves + change @ axis.T.T) - cost(problem, state, desired, moves)
         assert cost(*own, w + change) - cost(*own, w) == pytest.approx(whole, rel=1e-9)
         others = np.setdiff1d(np.arange(7), axis.states)

@@ -39,7 +39,9 @@ PIQP = "piqp-multistage"
 
 def drawn_query(rng: np.random.Generator, problem: Problem) -> Query:
     """A set-point some metres away, a state off hover, and a command before that rotors may have had."""
-    n, N, u_bar = problem.model.n, problem.horizon, problem.model.u_bar
+    n = problem.model.n
+    N = problem.horizon
+    u_bar = problem.model.u_bar
     size = rng.choice([0.1, 0.5, 2.0])
     state = np.zeros(n)
     state[:12] = size * rng.normal(size=12) * np.tile([1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 0.03, 0.1, 0.03, 0.1, 0.3, 0.3], 1)
@@ -51,7 +53,8 @@ def worst(problem: Problem, answer: Answer) -> float:
     """The largest KKT residual, multipliers relative to the largest."""
     assert answer.certificate is not None
     qp, solution = answer.certificate()
-    residuals, scale = kkt_residuals(qp, solution), max(1.0, float(np.abs(solution.z).max(initial=0.0)))
+    residuals = kkt_residuals(qp, solution)
+    scale = max(1.0, float(np.abs(solution.z).max(initial=0.0)))
     return max(residuals.primal, residuals.dual, residuals.stationarity / scale, residuals.complementarity / scale)
 
 
@@ -61,8 +64,11 @@ def worst(problem: Problem, answer: Answer) -> float:
 )
 def test_drawn_states_are_answered_cold_and_warm_as_by_daqp(name: str, draws: int) -> None:
     """Warm, from the active set of another state altogether."""
-    rng, problem = np.random.default_rng(1), paper_problem(name)
-    cold, warm, daqp = Core(problem), Core(problem), QPSolver("daqp", problem)
+    rng = np.random.default_rng(1)
+    problem = paper_problem(name)
+    cold = Core(problem)
+    warm = Core(problem)
+    daqp = QPSolver("daqp", problem)
     count = Counter[str]()
     for _ in range(draws):
         query = drawn_query(rng, problem)
@@ -106,7 +112,8 @@ def marked(name: str) -> ParameterSet:
 def test_flights_are_exact_in_every_period_and_those_of_piqp(name: str) -> None:
     settings = [*SCENARIOS[name], "controller.kkt_every=1"]
     flight, other = (Rollout(load_scenario(name, [*settings, f"controller.solver={by}"])).fly() for by in (CORE, PIQP))
-    control, theirs = flight.log.control, other.log.control
+    control = flight.log.control
+    theirs = other.log.control
     ours = np.isin(control.answered_by, [GAIN, CORE])
     assert ours.mean() > 0.9 or name == "paper-constrained-lag20"
     for residual in ("kkt_stationarity", "kkt_complementarity", "kkt_dual", "infeasibility"):
@@ -122,7 +129,8 @@ TERMS = ("Q_d", "P", "rest")
 def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, wider: float) -> tuple[Problem, Query]:
     """Three systems in one, with a query; moves are weighed in proportion to inputs, so that the axes stay apart."""
     problem = random_axes(rng, horizon=5, wider=wider)
-    objective, model = problem.objective, problem.model
+    objective = problem.objective
+    model = problem.model
     if "Q_d" in terms:
         objective = replace(objective, Q_d=3.0 * objective.Q_u)
     if "P" in terms:
@@ -157,7 +165,8 @@ def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
     methods = []
     for seed in range(15):
         rng = np.random.default_rng(seed)
-        size, wider = float(rng.choice([0.05, 2.0])), float(rng.choice([1.0, 1000.0]))
+        size = float(rng.choice([0.05, 2.0]))
+        wider = float(rng.choice([1.0, 1000.0]))
         problem, query = drawn(rng, terms, size=size, wider=wider)
         assert len(axes(problem)) == 3
         answer = Core(problem).solve(query)
@@ -179,12 +188,16 @@ def test_moves_that_tie_the_axes_leave_one_piece() -> None:
 
 def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
     """A height that late steps alone are held below: what is active moves to where there is no bound."""
-    problem, height, upper = paper_problem(), np.zeros((1, 12)), np.full((50, 1), np.inf)
-    height[0, 4], upper[20:] = 1.0, 2.0
+    problem = paper_problem()
+    height = np.zeros((1, 12))
+    upper = np.full((50, 1), np.inf)
+    height[0, 4] = 1.0
+    upper[20:] = 2.0
     penalty = Penalty(l1=np.full(1, 100.0), l2=np.full(1, 10.0))
     late = Constraint(name="late", C=height, lower=np.full((50, 1), -np.inf), upper=upper, penalty=penalty)
     problem = replace(problem, constraints=(late,))
-    core, violated = Core(problem), 0
+    core = Core(problem)
+    violated = 0
     for query in flight_queries(constrained_flight, problem, stride=1)[20:80]:
         answer = core.solve(query)
         assert answer.answered_by in (GAIN, CORE)
@@ -216,7 +229,8 @@ def test_active_constraints_that_depend_on_each_other() -> None:
 def tilted(problem: Problem) -> Query:
     """A roll that no torque could bring back within its bounds before the first predicted state."""
     state = np.zeros(12)
-    state[6], state[7] = np.radians(30.0), 5.0
+    state[6] = np.radians(30.0)
+    state[7] = 5.0
     return Query(state, np.zeros((problem.horizon, 4)), problem.model.u_bar)
 
 
@@ -246,7 +260,8 @@ def test_piqp_answers_infeasible_abandoned_and_invalid_problems(monkeypatch: pyt
 
 def with_rows(count: int, *, shared: bool = False) -> Problem:
     """The paper's problem with so many more rows on x, perhaps with one slack for all."""
-    C, bound = np.zeros((count, 12)), np.full(count, 1e3)
+    C = np.zeros((count, 12))
+    bound = np.full(count, 1e3)
     C[:, 0] = np.arange(1, count + 1)
     penalty = Penalty(l1=np.ones(count), l2=np.ones(count), largest=True) if shared else None
     rows = Constraint(name="rows", C=C, lower=-bound, upper=bound, penalty=penalty)
@@ -287,11 +302,15 @@ def test_equal_problems_share_tables_with_a_finite_lifetime() -> None:
 
 
 def test_controllers_that_share_tables_do_not_meddle() -> None:
-    problem, rng = paper_problem(), np.random.default_rng(2)
+    problem = paper_problem()
+    rng = np.random.default_rng(2)
     queries = [drawn_query(rng, problem) for _ in range(10)]
-    alone, one, other = Core(problem), Core(problem), Core(problem)
+    alone = Core(problem)
+    one = Core(problem)
+    other = Core(problem)
     for query, otherwise in zip(queries, reversed(queries), strict=True):
-        expected, answer = alone.solve(query), one.solve(query)
+        expected = alone.solve(query)
+        answer = one.solve(query)
         plan: Array = answer.plan.copy()
         other.solve(otherwise)
         np.testing.assert_array_equal(answer.plan, plan)

@@ -37,7 +37,8 @@ def infeasible(name: str) -> Answer:
     """A tilt and a turn that no bounded input undoes within the first period."""
     problem = paper_problem()
     tilted = np.zeros(12)
-    tilted[6], tilted[7] = np.radians(30.0), 5.0
+    tilted[6] = np.radians(30.0)
+    tilted[7] = 5.0
     desired = problem.desired(np.zeros((50, 4)))
     return QPSolver(name, problem).solve(Query(tilted, desired, problem.model.u_bar))
 
@@ -53,7 +54,8 @@ def test_a_failure_leaves_the_next_solve_alone(name: str) -> None:
     solver = QPSolver(name, problem)
     desired = problem.desired(np.zeros((50, 4)))
     tilted = np.zeros(12)
-    tilted[6], tilted[7] = np.radians(30.0), 5.0
+    tilted[6] = np.radians(30.0)
+    tilted[7] = 5.0
     assert solver.solve(Query(tilted, desired, problem.model.u_bar)).status in {"primal_infeasible", "unsolved"}
     hover = solver.solve(Query(np.zeros(12), desired, problem.model.u_bar))
     assert hover.status == SOLVED
@@ -90,7 +92,8 @@ def test_the_unconstrained_optimum_is_tried_first_unless_size_or_rounding_forbid
     state = np.zeros(12)
     state[[0, 2, 4, 6, 8]] = [0.02, -0.03, -0.05, 0.002, -0.003]
     query = Query(1e-2 * state, np.zeros((problem.horizon, 4)), problem.model.u_bar)
-    answer, whole = make_solver("piqp", problem).solve(query), QPSolver("piqp", problem).solve(query)
+    answer = make_solver("piqp", problem).solve(query)
+    whole = QPSolver("piqp", problem).solve(query)
     assert answer.answered_by == by
     assert answer.certificate is not None
     assert kkt_residuals(*answer.certificate()).worst < 1e-5
@@ -130,7 +133,8 @@ def test_equality_rows_and_multipliers() -> None:
         query = (0.1 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
         plans = []
         for formulation in (Staged(problem), Condensed(problem)):
-            backend, peer = DaqpDense(), Piqp(dense=True)
+            backend = DaqpDense()
+            peer = Piqp(dense=True)
             qp = formulation.assemble(Query(*query))
             backend.setup(formulation.qp)
             peer.setup(Condensed(problem).qp)
@@ -148,7 +152,8 @@ def test_equality_rows_and_multipliers() -> None:
 
 def small_qp(rng: np.random.Generator, name: str) -> QP:
     """Equality, one-sided and two-sided rows, and a box open in part, in the matrices that a back end takes."""
-    n, inf = 5, math.inf
+    n = 5
+    inf = math.inf
     root = rng.normal(size=(n, n))
     entry = find_solver(name)
     matrix = csc_matrix if isinstance(entry.formulate(paper_problem()), Staged) else np.asarray
@@ -172,8 +177,10 @@ def test_every_part_of_a_qp_may_change_from_one_solve_to_the_next(name: str) -> 
     Other solvers of qpsolvers have the same back end as clarabel.  The core is none: it solves one problem, whose
     queries alone change.
     """
-    rng, inf = np.random.default_rng(2), math.inf
-    qp, other = small_qp(rng, name), small_qp(rng, name)
+    rng = np.random.default_rng(2)
+    inf = math.inf
+    qp = small_qp(rng, name)
+    other = small_qp(rng, name)
     changes = {
         **{part: getattr(other, part) for part in ("P", "c", "A", "G")},
         "b": np.array([-0.4]),
@@ -185,7 +192,8 @@ def test_every_part_of_a_qp_may_change_from_one_solve_to_the_next(name: str) -> 
     cases = [qp, *(step for part, value in changes.items() for step in (replace(qp, **{part: value}), qp))]
     opened = replace(qp, h_l=np.full(3, -inf), h_u=np.array([inf, 0.0, inf]))
     cases += [opened, qp, replace(qp, x_l=np.full(5, -inf), x_u=np.full(5, inf)), qp, replace(opened, P=other.P), qp]
-    backend, answers = make_backend(name), []
+    backend = make_backend(name)
+    answers = []
     backend.setup(qp)
     for case in cases:
         solution = backend.solve(case)

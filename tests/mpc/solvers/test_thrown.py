@@ -53,7 +53,8 @@ def thrown(rng: np.random.Generator, problem: Problem) -> Query:
 def test_what_is_called_solved_is_the_optimum(name: str) -> None:
     scenario, settings = PROBLEMS[name]
     problem = paper_problem(scenario, *settings, f"controller.horizon={HORIZON}")
-    solver, rng = QPSolver("piqp-multistage", problem), np.random.default_rng(67)
+    solver = QPSolver("piqp-multistage", problem)
+    rng = np.random.default_rng(67)
     without = 0
     for _ in range(STATES):
         query = thrown(rng, problem)

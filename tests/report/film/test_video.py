@@ -50,7 +50,9 @@ def test_the_film_has_the_frames_requested(
     backend: str, short_run: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One of each second, in two pieces."""
-    path, reports, before = tmp_path / "film" / "flight.mp4", list[tuple[int, int]](), dict(os.environ)
+    path = tmp_path / "film" / "flight.mp4"
+    reports = list[tuple[int, int]]()
+    before = dict(os.environ)
     path.parent.mkdir()
     monkeypatch.setattr(video, "_FEWEST_FRAMES", 3)
     render_video(short_run, path, workers=2, fps=1, progress=lambda *report: reports.append(report))
@@ -61,7 +63,8 @@ def test_the_film_has_the_frames_requested(
     frames, meta = decode(path)
     assert frames.shape == (6, 720, 1280, 3)
     assert (meta["fps"], meta["codec"], meta["pix_fmt"][:7]) == (1.0, "h264", "yuv420p")
-    sky, ground = frames[:, 60:100, 500:780].mean(axis=(1, 2)), frames[:, 500:540, 500:780].mean(axis=(1, 2))
+    sky = frames[:, 60:100, 500:780].mean(axis=(1, 2))
+    ground = frames[:, 500:540, 500:780].mean(axis=(1, 2))
     assert (sky[:, 2] > sky[:, 0] + 15.0).all()  # a blue sky above a grey floor, in every frame of both pieces
     assert (np.ptp(ground, axis=1) < 40.0).all()
     assert ground.min() > 60.0
@@ -81,7 +84,8 @@ def test_a_long_film_has_fewer_frames_per_second_unless_told() -> None:
 
 def told(frames: tuple[int, ...], reports: list[tuple[float, int, int]], monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What an estimate of films of so many frames says, of which (time, done, total) are reported."""
-    times, said = iter([0.0, *(time for time, _, _ in reports)]), list[str]()
+    times = iter([0.0, *(time for time, _, _ in reports)])
+    said = list[str]()
     monkeypatch.setattr(video.clock, "monotonic", lambda: next(times))
     monkeypatch.setattr(video._log, "info", lambda text, *values: said.append(text % values))
     estimate = Estimate(frames, "the page is there")
@@ -190,7 +194,10 @@ def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Flig
     rows = np.array([10, 200, 777])
     at = make_footage(filmed(short_run), plant.t[rows])
     assert at.position == pytest.approx(plant.state[rows][:, POSITION])
-    x, y, z, w = at.quaternion[:, 1], at.quaternion[:, 2], at.quaternion[:, 3], at.quaternion[:, 0]
+    x = at.quaternion[:, 1]
+    y = at.quaternion[:, 2]
+    z = at.quaternion[:, 3]
+    w = at.quaternion[:, 0]
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     assert up == pytest.approx(body_to_world(plant.state[rows][:, EULER])[:, :, 2])
     between = make_footage(filmed(short_run), 0.5 * (plant.t[rows] + plant.t[rows + 1]))

@@ -100,7 +100,8 @@ def test_thrusts_stand_on_the_rotors_and_grow_with_squared_speeds(content: Conte
 
 
 def test_every_period_has_its_predicted_horizon(content: Content, short_run: Flight) -> None:
-    control, predicted = short_run.log.control, short_run.log.predicted
+    control = short_run.log.control
+    predicted = short_run.log.predicted
     assert predicted is not None
     np.testing.assert_allclose(content.times("/world/horizon"), control.t, atol=1e-9)
     strips = np.array(content.rows("/world/horizon", "strips"))[:, 0]
@@ -161,8 +162,10 @@ def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run
 def test_forces_torques_wind_battery_and_lagging_rotors_have_their_curves(
     record: Callable[[Flight], Content], short_run: Flight
 ) -> None:
-    plant, rng = short_run.log.plant, np.random.default_rng(0)
-    wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
+    plant = short_run.log.plant
+    rng = np.random.default_rng(0)
+    wrench = rng.normal(size=(plant.t.size, 6))
+    wind = rng.normal(size=(plant.t.size, 3))
     battery = rng.uniform(size=(plant.t.size, 2))
     plant = dataclasses.replace(plant, speeds=plant.speeds - 1.0, wrench=wrench, wind=wind, battery=battery)
     run = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
@@ -204,10 +207,12 @@ def has_values(content: Content, entity: str) -> bool:
 def test_a_plot_names_only_what_was_recorded_and_none_is_blank(
     record: Callable[[Flight], Content], short_run: Flight, case: str
 ) -> None:
-    log, limits = short_run.log, short_run.limits
+    log = short_run.log
+    limits = short_run.limits
     assert any(limit.start > 6.0 for limit in limits), "one that this flight does not reach"
     if case == "with a target":
-        target, thrust = np.full((log.control.t.size, 4), 39.0), np.full(log.plant.t.size, 40.0)
+        target = np.full((log.control.t.size, 4), 39.0)
+        thrust = np.full(log.plant.t.size, 40.0)
         log = dataclasses.replace(
             log,
             control=dataclasses.replace(log.control, target=target),
@@ -229,7 +234,8 @@ def test_a_plot_names_only_what_was_recorded_and_none_is_blank(
 
 
 def test_dashes_of_the_reference_lie_on_a_small_course(record: Callable[[Flight], Content], short_run: Flight) -> None:
-    angle, radius = np.linspace(0.0, 4.0 * math.pi, short_run.log.control.t.size), 0.2
+    angle = np.linspace(0.0, 4.0 * math.pi, short_run.log.control.t.size)
+    radius = 0.2
     reference = short_run.log.control.reference.copy()
     reference[:, :3] = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     control = dataclasses.replace(short_run.log.control, reference=reference)
@@ -262,9 +268,12 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
 ) -> None:
     control = short_run.log.control
     K = control.t.size
-    status, fallback = [SOLVED] * K, control.fallback.copy()
+    status = [SOLVED] * K
+    fallback = control.fallback.copy()
     status[20:30] = [UNCONSTRAINED] * 10
-    status[40:43], fallback[40:43], fallback[-40:] = ["infeasible"] * 3, [1, 1, 2], 2
+    status[40:43] = ["infeasible"] * 3
+    fallback[40:43] = [1, 1, 2]
+    fallback[-40:] = 2
     by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["core"] * 10 + ["fallback"] * 3 + ["piqp-dense"] * (K - 43)
     changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
     log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")

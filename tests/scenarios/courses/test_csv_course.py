@@ -67,7 +67,8 @@ def test_with_velocities_a_cubic_is_met_exactly() -> None:
         return np.stack([np.polynomial.Polynomial(column).deriv(order)(times) for column in cubic.T], axis=1)
 
     table = Table(t=t, poses=np.column_stack([at(t), t]), velocities=at(t, 1), sha256="")
-    path, since = through_rows(table), np.linspace(0.0, 2.2, 50)
+    path = through_rows(table)
+    since = np.linspace(0.0, 2.2, 50)
     np.testing.assert_allclose(path.pose(since)[:, :3], at(2.0 + since), atol=1e-12)
     np.testing.assert_allclose(path.pose(since)[:, 3], 2.0 + since)
 
@@ -78,7 +79,8 @@ def test_yaw_that_wraps_is_unwrapped(tmp_path: Path) -> None:
 
 
 T = np.arange(0.0, 6.05, 0.1)
-RADIUS, RATE = 2.0, 0.5
+RADIUS = 2.0
+RATE = 0.5
 """A circle, [m] and [rad/s]: 1 m/s."""
 
 
@@ -132,7 +134,8 @@ def test_velocities_at_rest_in_every_row_are_noted(tmp_path: Path) -> None:
     """Rows a second apart, between which the course would stop each time."""
     rows = "".join(f"{t},{1.5 * t},0,1,0,0,0,0\n" for t in range(9))
     (note,) = read_course_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}")).notes
-    assert note == "column vx is 0 m/s on average, but column x moves at 1.5 m/s"
+    assert "vx is 0 m/s" in note
+    assert "x moves at 1.5 m/s" in note
 
 
 @pytest.mark.parametrize(("factor", "hint"), [(1000.0, "mm/s"), (100.0, "cm/s")])
@@ -147,13 +150,15 @@ def test_velocities_many_times_those_of_the_positions_are_refused(tmp_path: Path
 
 def test_positions_in_millimetres_are_noted_or_refused_by_their_size(tmp_path: Path) -> None:
     (note,) = read_course_table(circle(tmp_path, place=100.0)).notes
-    assert note == "column x: the course moves at 99.99 m/s on average; if it is in mm instead of m, 0.09999 m/s"
+    assert "99.99 m/s" in note
+    assert "in mm instead of m, 0.09999 m/s" in note
     rule = "must not make the course faster than 340 m/s on average; got 999.9 .if it is in mm instead of m, 0.9999 m/s"
     with pytest.raises(FileError, match=rule):
         read_course_table(circle(tmp_path, place=1000.0))
     still = "t,x,y,z,yaw\n0,0,0,1000,0\n10,0,0,1000,0\n"
     course = Csv(type="csv", file=str(write(tmp_path, still))).build(np.array([0.0, 0.0, 1.0, 0.0]), 9.81)
-    assert course.notes == ("columns x, y, z begin 999 m from the vehicle; if they are in mm instead of m, 0 m",)
+    (note,) = course.notes
+    assert "999 m from the vehicle" in note
 
 
 def test_yaw_in_degrees_is_noted_or_refused_by_its_size(tmp_path: Path) -> None:

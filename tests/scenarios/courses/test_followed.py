@@ -31,7 +31,9 @@ def test_without_set_points_it_is_the_filtered_course(name: str) -> None:
 
 def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
     scenario = load_scenario("paper-constrained")
-    course, tau_r, tau_s = Assembly(scenario).course, scenario.reference.response_time, scenario.control_period
+    course = Assembly(scenario).course
+    tau_r = scenario.reference.response_time
+    tau_s = scenario.control_period
     keep = math.exp(-3.0 * tau_s / tau_r)
     followed = Assembly(scenario).followed()
     before = Assembly(scenario).reference(SAMPLES)
@@ -40,7 +42,9 @@ def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
     followed.set(300, {"yaw": -1.0, "x": 0.5})
     result = rows(followed)
     expected = course.sample(tau_s * np.arange(SAMPLES))
-    expected[101:, 0], expected[301:, 0], expected[301:, 3] = 2.0, 0.5, -1.0
+    expected[101:, 0] = 2.0
+    expected[301:, 0] = 0.5
+    expected[301:, 3] = -1.0
     last = course.initial
     for k, sample in enumerate(expected):
         expected[k] = last = sample + keep * (last - sample)
@@ -69,7 +73,8 @@ def test_what_is_reported_of_a_course_is_what_was_followed_of_it() -> None:
     plain = load_scenario("paper-constrained")
     assert {step.channel for step in Assembly(plain).course_steps} == {"x", "y", "z", "yaw"}
     assert {step.channel for step in Assembly(with_setpoint(5.0)).course_steps} == {"y", "z", "yaw"}
-    whole, nearly = report(Assembly(plain)), report(Assembly(with_setpoint(59.9)))
+    whole = report(Assembly(plain))
+    nearly = report(Assembly(with_setpoint(59.9)))
     assert nearly.tilt == whole.tilt
     assert report(Assembly(with_setpoint(0.05))).tilt > 0.9 * whole.tilt  # y steps by 10 m as before
     assert report(Assembly(with_setpoint(0.05, "x=0.1, y=0.1"))).tilt < 0.1 * whole.tilt

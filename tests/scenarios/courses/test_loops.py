@@ -59,7 +59,10 @@ def test_a_figure_eight_is_the_lemniscate_of_gerono() -> None:
 
 
 def test_the_rate_of_a_ramped_angle_is_the_known_polynomial() -> None:
-    rate, ramp, total, h = 0.7, 2.0, 4.0, 1e-4
+    rate = 0.7
+    ramp = 2.0
+    total = 4.0
+    h = 1e-4
     t = np.arange(0.0, total / rate + ramp, h)
     result = derivative(ramped(t, rate=rate, total=total, ramp=ramp), h)
     s = np.clip(np.minimum(t, total / rate + ramp - t)[1:-1] / ramp, 0.0, 1.0)

@@ -17,7 +17,8 @@ VALUES = np.array([[0.0, 1.0], [2.0, -1.0], [1.0, 0.5], [4.0, 3.0], [0.0, 0.0]])
 
 def kkt_solution(times: Array, values: Array, order: int) -> Array:
     """(n, 2 order, c) coefficients in t - t_i: min c'Qc, A c = b, with all conditions as rows of A, solved as one."""
-    n, p = times.size - 1, 2 * order
+    n = times.size - 1
+    p = 2 * order
     powers = np.arange(p)
 
     def row(segment: int, t: float, k: int) -> Array:
@@ -26,7 +27,8 @@ def kkt_solution(times: Array, values: Array, order: int) -> Array:
         return result
 
     Q = np.zeros((n * p, n * p))
-    rows, right = [], []
+    rows = []
+    right = []
     for i, T in enumerate(np.diff(times)):
         for a in range(order, p):
             for b in range(order, p):
@@ -65,16 +67,19 @@ def test_the_whole_kkt_system_has_the_same_solution(order: int) -> None:
 
 
 def test_time_in_other_units_is_the_same_curve() -> None:
-    slow, fast = smoothest(1e4 * TIMES, VALUES, SNAP), smoothest(1e-4 * TIMES, VALUES, SNAP)
+    slow = smoothest(1e4 * TIMES, VALUES, SNAP)
+    fast = smoothest(1e-4 * TIMES, VALUES, SNAP)
     s = np.linspace(0.0, TIMES[-1], 50)
     np.testing.assert_allclose(slow(1e4 * s), fast(1e-4 * s), rtol=1e-9, atol=1e-9)
 
 
 def test_a_path_has_the_snap_of_its_position_and_the_acceleration_of_its_yaw() -> None:
-    start, poses = np.array([0.0, 0.0, 1.0, 0.0]), np.array([[1.0, 2.0, 3.0, 1.0], [4.0, 0.0, 1.0, -1.0]])
+    start = np.array([0.0, 0.0, 1.0, 0.0])
+    poses = np.array([[1.0, 2.0, 3.0, 1.0], [4.0, 0.0, 1.0, -1.0]])
     path = minimum_snap(start, poses, [2.0, 5.0])
     assert path.duration == 5.0
     assert path.kinks == ()
     np.testing.assert_allclose(path.pose(np.array([0.0, 2.0, 5.0])), [start, *poses], atol=1e-12)
-    t, knots = np.linspace(0.0, 5.0, 20), np.array([0.0, 2.0, 5.0])
+    t = np.linspace(0.0, 5.0, 20)
+    knots = np.array([0.0, 2.0, 5.0])
     np.testing.assert_allclose(path.pose(t)[:, 3], smoothest(knots, np.array([[0.0], [1], [-1]]), 2)(t)[:, 0])

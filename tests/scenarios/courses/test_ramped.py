@@ -115,7 +115,8 @@ def test_the_heading_begins_at_the_initial_yaw() -> None:
     turned = base.replace({"initial.euler": [0.0, 0.0, 40.0]})
     (plain, _), (other, _) = motion_of(base), motion_of(turned)
     np.testing.assert_allclose(other.position, plain.position, atol=1e-12)
-    cos, sin = math.cos(math.radians(40.0)), math.sin(math.radians(40.0))
+    cos = math.cos(math.radians(40.0))
+    sin = math.sin(math.radians(40.0))
     x, y, z = plain.body_rates.T
     np.testing.assert_allclose(other.body_rates, np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=1), atol=1e-9)
 

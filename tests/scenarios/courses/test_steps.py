@@ -58,7 +58,8 @@ def test_the_steps_of_the_papers_course() -> None:
 
 def test_the_filter_is_the_first_order_lag_in_closed_form() -> None:
     """A step from a to b: F(k) = b + (a - b) exp(-3 (k + 1) tau_s / tau_r)."""
-    response_time, k = 5.0, np.arange(300)
+    response_time = 5.0
+    k = np.arange(300)
     filtered = smooth(np.full(300, 10.0), initial=2.0, response_time=response_time, period=PERIOD)
     expected = 10.0 + (2.0 - 10.0) * np.exp(-3.0 * (k + 1) * PERIOD / response_time)
     np.testing.assert_allclose(filtered, expected, rtol=1e-12)

@@ -87,14 +87,16 @@ def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: 
 @pytest.mark.parametrize("kind", ["waypoints", "minimum_snap", "circle", "helix", "figure_eight"])
 def test_every_course_waits_for_its_start(kind: str) -> None:
     t = np.arange(0.0, 20.0, 0.05)
-    at_once, later = Assembly(scenario(kind)).course, Assembly(scenario(kind, start=2.5)).course
+    at_once = Assembly(scenario(kind)).course
+    later = Assembly(scenario(kind, start=2.5)).course
     np.testing.assert_allclose(later.sample(t + 2.5), at_once.sample(t), atol=1e-12)
     np.testing.assert_array_equal(later.sample(np.array([0.0, 1.0, 2.45])), np.tile(later.initial, (3, 1)))
 
 
 @pytest.mark.parametrize("kind", REFERENCES)
 def test_every_course_passes_through_the_filter_from_its_initial_pose(kind: str) -> None:
-    course, t = Assembly(scenario(kind)).course, 0.05 * np.arange(100)
+    course = Assembly(scenario(kind)).course
+    t = 0.05 * np.arange(100)
     reference = Assembly(scenario(kind, response_time=2.0)).reference(100)
     for column in range(4):
         expected = smooth(course.sample(t)[:, column], initial=course.initial[column], response_time=2.0, period=0.05)

@@ -241,7 +241,8 @@ NONLINEAR: dict[str, Any] = {
 def test_fields_of_nonlinear_mpc_arrive() -> None:
     law = built(NONLINEAR).law
     assert isinstance(law, NonlinearMPC)
-    made, x = law.settings, math.radians(1.0)
+    made = law.settings
+    x = math.radians(1.0)
     assert (law.horizon, law.problem.horizon, law.numbers.stride, law.solver) == (12, 4, 3, "core")
     assert (made.iterations, made.shift, made.substeps, made.inputs) == (3, True, 2, "speed")
     weights = Weights(position=(1.0, 2.0, 3.0), attitude=4.0, velocity=5.0, body_rates=6.0, input=7.0, move=8.0)

@@ -39,7 +39,8 @@ Write = Callable[..., str]
 @pytest.fixture
 def written(tmp_path: Path) -> Iterator[Write]:
     """Writes a module under a name that nothing else has, and a scenario beside it; gives the scenario's path."""
-    before, count = set(sys.modules), itertools.count()
+    before = set(sys.modules)
+    count = itertools.count()
 
     def write(code: str, controller: str = 'controller = "{module}:Hover"', *, module: str | None = None) -> str:
         name = module or f"custom_{abs(hash(str(tmp_path)))}_{next(count)}"
@@ -163,14 +164,16 @@ def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: 
 
 def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> None:
     flight = Rollout(load_scenario(written(HOVER.replace("self.speeds\n", "self.speeds * np.nan\n")))).fly()
-    assert flight.log.reason == "at t = 0.000 s: the command is not finite: [nan, nan, nan, nan]"
+    assert "not finite: [nan, nan, nan, nan]" in flight.log.reason
 
 
 class Answers:
     """A law that overwrites its input and its answer, and returns a command changed in one part."""
 
     def __init__(self, **changes: Any) -> None:
-        self._speeds, self._plan, self._changes = np.full(4, 190.0), np.full((3, 4), 190.0), changes
+        self._speeds = np.full(4, 190.0)
+        self._plan = np.full((3, 4), 190.0)
+        self._changes = changes
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         assert now.acting is not None

@@ -39,7 +39,8 @@ def test_a_file_holds_only_what_differs(tmp_path: Path) -> None:
         upper = 3.0
         """,
     )
-    result, base = load_scenario(mine), load_scenario("paper-constrained")
+    result = load_scenario(mine)
+    base = load_scenario("paper-constrained")
     assert (result.name, result.group, result.vehicle.mass, result.controller.horizon) == ("mine", "other", 4.2, 30)
     assert result.reference == base.reference
     changed = "controller.horizon = 30; constraints.roll.tolerance = 0.5; constraints.climb.signal = "

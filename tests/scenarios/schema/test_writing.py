@@ -63,7 +63,8 @@ def fields_below(value: object, kind: type[Any], path: str) -> Iterator[tuple[ty
 def test_every_field_is_printed_also_of_absent_tables(name: str) -> None:
     """An absent one where its kind of table first occurs."""
     assembly = Assembly(load_scenario(name))
-    printed, table = set(), ""
+    printed = set()
+    table = ""
     for line in assembly.to_toml().splitlines():
         if heading := re.match(r"(?:# )?\[\[?([\w.]+)\]\]?(?:  #|$)", line):
             table = heading.group(1)

@@ -84,7 +84,8 @@ def test_momentum_theory_gives_the_current_of_hover() -> None:
     hummingbird = load_vehicle(vehicle_path("hummingbird"))
     resolved = Battery(cells=3, capacity=2.1).resolved(hummingbird)
     assert hummingbird.rotor_radius is not None
-    thrust, disc = 0.25 * hummingbird.mass * hummingbird.gravity, math.pi * hummingbird.rotor_radius**2
+    thrust = 0.25 * hummingbird.mass * hummingbird.gravity
+    disc = math.pi * hummingbird.rotor_radius**2
     power = 4.0 * thrust * math.sqrt(thrust / (2.0 * 1.225 * disc)) / EFFICIENCY
     assert resolved.reference_voltage == pytest.approx(12.6)
     assert resolved.hover_current == pytest.approx(power / 12.6)
@@ -104,7 +105,8 @@ def fallen(vehicle: Vehicle, effects: Effects, speeds: Array, integrator: Integr
 def test_thrust_has_the_factor_of_the_voltage(
     vehicle: Vehicle, integrator: Integrator, exponent: float, by_step: bool
 ) -> None:
-    battery, nothing = replace(SMALL, exponent=exponent), Disturbance() if by_step else None
+    battery = replace(SMALL, exponent=exponent)
+    nothing = Disturbance() if by_step else None
     speeds = np.full(4, 1.1 * vehicle.hover_speed)
     climb, recorded = fallen(vehicle, Effects(battery=battery, disturbance=nothing), speeds, integrator)
     factor = (recorded[:, 0] / 16.0) ** exponent
@@ -119,8 +121,10 @@ def test_a_weak_rotor_draws_its_share_and_its_torque_sags_with_its_thrust(vehicl
         flown = plant.advance(plant.vehicle.hover_speeds, 1)
     expected, _ = discharged(SMALL, 0.25, 1)
     np.testing.assert_allclose(flown["battery"], expected, rtol=1e-14)
-    b, d = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient)
-    factor, spin = (expected[0, 0] / 16.0) ** 2, vehicle.rotor_spins[0]
+    b = vehicle.thrust_coefficient
+    d = vehicle.drag_to_thrust * vehicle.thrust_coefficient
+    factor = (expected[0, 0] / 16.0) ** 2
+    spin = vehicle.rotor_spins[0]
     rate = spin * d / b * factor * 0.25 * vehicle.mass * vehicle.gravity / vehicle.inertia[2] * TIMESTEP
     assert flown["physics"][0, 13] == pytest.approx(rate, rel=1e-6)
 

@@ -36,7 +36,9 @@ def test_a_push_accelerates_by_its_force_while_it_lasts(vehicle: Vehicle, integr
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
 def test_a_push_beside_the_centre_turns_the_vehicle(vehicle: Vehicle, integrator: Integrator) -> None:
     """A force along world x at the body's y turns it about z, by the lever arm that the yaw leaves."""
-    yaw, arm, force = 0.7, 0.2, 0.3
+    yaw = 0.7
+    arm = 0.2
+    force = 0.3
     with Plant(vehicle, changes=[pushed((force, 0.0, 0.0), (0.0, arm, 0.0))], integrator=integrator) as plant:
         plant.reset(make_state(euler=(0.0, 0.0, yaw)))
         flown = plant.advance(plant.vehicle.hover_speeds, 20)
@@ -68,7 +70,8 @@ def test_another_mass_hovers_no_more(vehicle: Vehicle) -> None:
 
 
 def test_rotors_follow_by_another_time_constant(vehicle: Vehicle) -> None:
-    start, target = vehicle.hover_speed, vehicle.hover_speed + 20.0
+    start = vehicle.hover_speed
+    target = vehicle.hover_speed + 20.0
     changes = [LagChange(at=0.0, rise=0.05, fall=0.1), LagChange(at=0.1, rise=0.0, fall=0.0)]
     with Plant(vehicle, changes=changes) as plant:
         speeds = plant.advance(np.full(4, target), HOLD)["speeds"]
@@ -79,7 +82,8 @@ def test_rotors_follow_by_another_time_constant(vehicle: Vehicle) -> None:
 
 def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
     """Rescheduled midway, a plant flies as one scheduled from the start; what is past is not done again."""
-    first, second = MassChange(at=0.05, factor=1.1), MassChange(at=0.15, factor=0.9)
+    first = MassChange(at=0.05, factor=1.1)
+    second = MassChange(at=0.15, factor=0.9)
     with Plant(vehicle, changes=[first, second]) as scheduled, Plant(vehicle, changes=[first]) as later:
         expected = scheduled.advance(scheduled.vehicle.hover_speeds, HOLD)["physics"]
         hover = later.vehicle.hover_speeds

@@ -58,7 +58,8 @@ def hovered(vehicle: Vehicle, disturbance: Disturbance, seed: int = 0) -> Array:
 
 def test_the_plant_is_pushed_and_turned_by_it(vehicle: Vehicle) -> None:
     """Speed and rate after 0.5 s have the deviation of the process's integral."""
-    mass, inertia = vehicle.mass, vehicle.inertia[0]
+    mass = vehicle.mass
+    inertia = vehicle.inertia[0]
     force = (0.5 * mass, 0.0, 0.0)  # [N]
     torque = (0.01 * inertia, 0.0, 0.0)  # [N m], so small that the thrust's tilt adds little
     acting = Disturbance(

@@ -46,7 +46,8 @@ def still_air(velocity: tuple[float, float, float], *gusts: Gust) -> WindField:
 
 def test_rotor_drag_slows_a_level_glide_exponentially(vehicle: Vehicle) -> None:
     """Exponentially: m dv/dt = -k (sum w) v while level; along z no rotor is held back."""
-    drag, hover = 2e-3, vehicle.hover_speed
+    drag = 2e-3
+    hover = vehicle.hover_speed
     rate = 4.0 * drag * hover / vehicle.mass
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(vx=3.0, vy=-1.0))
@@ -80,7 +81,8 @@ def test_a_rotor_moment_lifts_the_side_that_meets_the_air(vehicle: Vehicle) -> N
 
 def test_a_climb_takes_from_the_rotor_moment(vehicle: Vehicle) -> None:
     """J_y dq/dt = -(m_y (sum w) - k_y v_z) v_x: at v_z = m_y (sum w) / k_y nothing turns."""
-    moment, inflow = 1e-5, 0.01
+    moment = 1e-5
+    inflow = 0.01
     gone = moment * 4.0 * vehicle.hover_speed / inflow
     rates = []
     for climb in (0.0, gone, -gone):
@@ -96,7 +98,8 @@ def test_a_stated_inflow_moment_is_that_of_rotors_and_body(
     vehicle: Vehicle, stated: tuple[float, float] | None
 ) -> None:
     """Without it, the ellipsoid that drags has Munk's."""
-    drag, seconds = (0.02, 0.03, 0.06), 0.02
+    drag = (0.02, 0.03, 0.06)
+    seconds = 0.02
     with Plant(vehicle, effects=Effects(air=Air(body_drag=drag, inflow_moment=stated))) as plant:
         plant.reset(moving(vx=2.0, vy=1.0, vz=1.0))
         rates = plant.advance(plant.vehicle.hover_speeds, 20)["physics"][-1, 11:14]
@@ -108,7 +111,8 @@ def test_a_stated_inflow_moment_is_that_of_rotors_and_body(
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
 def test_inflow_slows_a_climb_exponentially(vehicle: Vehicle, integrator: Integrator) -> None:
     """In hover m dv/dt = -4 c w v, v the velocity of climb; and without inflow the climb goes on."""
-    c, seconds = 4e-4, 1.5
+    c = 4e-4
+    seconds = 1.5
     rate = 4.0 * c * vehicle.hover_speed / vehicle.mass
     for coefficient, left in ((c, math.exp(-rate * seconds)), (0.0, 1.0)):
         effects = Effects(air=Air(inflow=coefficient))
@@ -130,7 +134,8 @@ def test_rate_damping_slows_a_turn_exponentially(vehicle: Vehicle) -> None:
 
 def test_rotor_drag_carries_a_tilted_vehicle_to_its_terminal_speed(vehicle: Vehicle) -> None:
     """With attitude held, along body x: m dv/dt = m g sin(tilt) - k (sum w) v."""
-    drag, tilt = 4e-3, 0.2
+    drag = 4e-3
+    tilt = 0.2
     speed = vehicle.hover_speed / math.sqrt(math.cos(tilt))
     state = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
@@ -157,7 +162,8 @@ def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, n
 
 def test_added_mass_is_that_of_a_sphere_and_that_of_the_compiled_model(vehicle: Vehicle) -> None:
     """A sphere takes half of the air in its place along."""
-    radius, areas = 0.2, (0.02, 0.03, 0.06)
+    radius = 0.2
+    areas = (0.02, 0.03, 0.06)
     sphere = added_mass([math.pi * radius**2] * 3, 1.2)
     np.testing.assert_allclose(sphere, 0.5 * 1.2 * 4.0 / 3.0 * math.pi * radius**3)
     model = compile_model(vehicle, body_drag=areas, air_density=1.2)
@@ -208,7 +214,8 @@ def test_constant_force_and_torque_accelerate(vehicle: Vehicle) -> None:
 
 def test_white_noise_walks_as_a_random_walk(vehicle: Vehicle) -> None:
     """The variance of velocity grows as (density / m)^2 t on each axis; the same seed gives the same flight."""
-    density, ends = 0.05, []
+    density = 0.05
+    ends = []
     for seed in [*range(60), 0]:
         disturbance = Effects(disturbance=Disturbance(force_noise=density))
         with Plant(vehicle, effects=disturbance, rng=np.random.default_rng(seed)) as plant:
@@ -226,12 +233,16 @@ def test_white_noise_walks_as_a_random_walk(vehicle: Vehicle) -> None:
 
 def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
     """Each rotor by the height of its own disc; torques about z stay those of the rotors alone."""
-    radius, height, roll = 0.2, 0.15, 0.3
+    radius = 0.2
+    height = 0.15
+    roll = 0.3
     speeds = vehicle.hover_speed * np.array([1.05, 0.95, 1.05, 0.95])
     with Plant(vehicle, effects=Effects(ground=Ground(effect=True, rotor_radius=radius))) as plant:
         plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
         flown = plant.advance(speeds, 1)
-    floor, disc = -0.132, 0.034  # where the drawing has them
+    # where the drawing has them
+    floor = -0.132
+    disc = 0.034
     above = height - floor + disc * math.cos(roll) + vehicle.hubs[:, 1] * math.sin(roll)
     gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
     up = np.array([0.0, -math.sin(roll), math.cos(roll)])
@@ -289,9 +300,17 @@ def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
 def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: Integrator, layout: str) -> None:
     """From random motions, at the middle of the step: drag of two kinds, spinning rotors, pushes, ground effect."""
     vehicle = uneven() if layout == "uneven" else vehicle
-    rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
-    linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
-    moment, climbing, damping, lost = (2e-4, -3e-4), (0.1, -0.2), (0.02, 0.03, 0.01), 2e-3
+    rng = np.random.default_rng(6)
+    radius = 0.15
+    drag = 3e-3
+    inertia = 2e-4
+    step = 1e-6
+    linear = (0.3, 0.2, 0.05)
+    quadratic = (0.08, 0.1, 0.12)
+    moment = (2e-4, -3e-4)
+    climbing = (0.1, -0.2)
+    damping = (0.02, 0.03, 0.01)
+    lost = 2e-3
     dynamics = RotorDynamics(rise=0.03, fall=0.05, inertia=inertia)
     effects = Effects(
         air=Air(
@@ -302,7 +321,8 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
         rotors=dynamics,
     )
     push = Push(at=0.0, duration=1.0, force=(0.5, -0.3, 0.2), point=(0.1, -0.05, 0.02))
-    wind, shape = (2.0, -1.0, 0.5), outline(vehicle)
+    wind = (2.0, -1.0, 0.5)
+    shape = outline(vehicle)
     changes = (PushChange(at=0.0, pushes=(push,)),)
     with Plant(
         vehicle, timestep=step, effects=effects, changes=changes, wind=still_air(wind), integrator=integrator
@@ -314,7 +334,8 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
             plant.reset(state, speeds)
             before = plant.physics
             wrench = plant.advance(target, 1)["wrench"][0]
-            turn, rates = Rotation.from_quat(before[4:8], scalar_first=True), before[11:14]
+            turn = Rotation.from_quat(before[4:8], scalar_first=True)
+            rates = before[11:14]
             (middle,), (slopes,) = respond(dynamics, speeds, target, np.array([0.5 * step]))
             air = before[8:11] - wind
             expected = rotor_drag(vehicle, drag, middle, turn, air, rates) + pushed(push, turn)

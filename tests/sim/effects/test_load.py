@@ -71,7 +71,8 @@ def test_payload_is_taken_up_and_let_go(vehicle: Vehicle) -> None:
         for _ in range(2):  # the second flight begins as the first did
             plant.reset(make_state(position=(0.0, 0.0, 100.0)))
             slopes = np.diff(plant.advance(plant.vehicle.hover_speeds, 1500)["physics"][:, 10]) / 1e-3
-            m, g = vehicle.mass, vehicle.gravity
+            m = vehicle.mass
+            g = vehicle.gravity
             for first, last, carried in ((0, 199, 0.0), (200, 499, 1.0), (500, 999, 2.0), (1000, 1498, 0.0)):
                 expected = m * g / (m + carried) - g
                 np.testing.assert_allclose(slopes[max(first - 1, 0) : last], expected, rtol=1e-9, atol=1e-9)

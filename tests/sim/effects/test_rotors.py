@@ -75,7 +75,8 @@ def test_an_answer_in_two_parts_is_the_answer_in_one() -> None:
 def test_the_rotors_of_the_plant_follow_that_law(vehicle: Vehicle, dynamics: RotorDynamics) -> None:
     """Their speeds, and by the torque about z their accelerations, as commands change."""
     commands = vehicle.hover_speed + np.random.default_rng(3).uniform(-40.0, 40.0, (4, 4))
-    edges, speeds = 1e-3 * np.arange(31), START
+    edges = 1e-3 * np.arange(31)
+    speeds = START
     with Plant(vehicle, effects=Effects(rotors=dynamics)) as plant:
         plant.reset(make_state(position=(0.0, 0.0, 50.0)), START)
         for command in commands:
@@ -95,11 +96,15 @@ def test_the_rotors_of_the_plant_follow_that_law(vehicle: Vehicle, dynamics: Rot
 
 def test_the_plant_climbs_as_its_lagging_rotors_do(vehicle: Vehicle) -> None:
     """Vertical motion under b w(t)^2 with w(t) = w_c + (w_0 - w_c) exp(-t / tau), integrated by hand."""
-    tau, start, command = 0.05, 180.0, 210.0
+    tau = 0.05
+    start = 180.0
+    command = 210.0
     with Plant(vehicle, effects=Effects(rotors=RotorDynamics(rise=tau, fall=tau))) as plant:
         plant.reset(make_state(), np.full(4, start))
         flown = plant.advance(np.full(4, command), 400)
-        t, gap, lift = 0.4, start - command, 4.0 * vehicle.thrust_coefficient / vehicle.mass
+        t = 0.4
+        gap = start - command
+        lift = 4.0 * vehicle.thrust_coefficient / vehicle.mass
         decay = math.exp(-t / tau)
         impulse = command**2 * t + 2.0 * command * gap * tau * (1.0 - decay) + gap**2 * tau / 2.0 * (1.0 - decay**2)
         assert plant.state()[5] == pytest.approx(lift * impulse - vehicle.gravity * t, rel=1e-5)
@@ -130,16 +135,20 @@ def spinning_bodies(vehicle: Vehicle, inertia: float, rates: Array, speeds: Arra
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="frame")
     body.add_freejoint()
-    body.mass, body.explicitinertial = vehicle.mass, True
+    body.mass = vehicle.mass
+    body.explicitinertial = True
     body.inertia = list(np.array(vehicle.inertia) - 4.0 * inertia * np.array([0.5, 0.5, 1.0]))
     for i, (place, spin) in enumerate(zip(vehicle.hubs, vehicle.rotor_spins, strict=True)):
         rotor = body.add_body(name=f"r{i}", pos=place)
         rotor.add_joint(name=f"j{i}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, 0.0, -float(spin)])
-        rotor.mass, rotor.inertia, rotor.explicitinertial = 1e-9, [inertia / 2, inertia / 2, inertia], True
+        rotor.mass = 1e-9
+        rotor.inertia = [inertia / 2, inertia / 2, inertia]
+        rotor.explicitinertial = True
     model = spec.compile()
     model.opt.gravity[:] = 0.0
     data = mujoco.MjData(model)
-    data.qvel[3:6], data.qvel[6:10] = rates, speeds
+    data.qvel[3:6] = rates
+    data.qvel[6:10] = speeds
     mujoco.mj_forward(model, data)
     # Motor torques that give the rotors the required accelerations relative to the body: solve M a + c = f for them.
     mass = np.zeros((model.nv, model.nv))
@@ -152,7 +161,8 @@ def spinning_bodies(vehicle: Vehicle, inertia: float, rates: Array, speeds: Arra
 
 def test_gyroscopic_and_spin_up_torque_are_those_of_real_rotors(vehicle: Vehicle) -> None:
     inertia = 2e-3
-    rates, speeds = np.array([0.6, -0.9, 0.3]), np.array([150.0, 190.0, 230.0, 210.0])
+    rates = np.array([0.6, -0.9, 0.3])
+    speeds = np.array([150.0, 190.0, 230.0, 210.0])
     dynamics = RotorDynamics(rise=0.05, fall=0.05, inertia=inertia)
     target = speeds + np.array([4.0, -3.0, 2.0, 5.0])
     state = make_state(position=(0.0, 0.0, 50.0))

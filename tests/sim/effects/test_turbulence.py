@@ -21,7 +21,8 @@ def spectrum(dryden: Dryden, frequency: Array) -> Array:
     wave_number = 2.0 * np.pi * frequency / dryden.airspeed  # [rad/m]
     x2 = np.square(wave_number[:, None] * dryden.lengths)
     scale = np.square(dryden.intensities) * dryden.lengths / np.pi
-    longitudinal, transverse = 2.0 / (1.0 + x2), (1.0 + 3.0 * x2) / np.square(1.0 + x2)
+    longitudinal = 2.0 / (1.0 + x2)
+    transverse = (1.0 + 3.0 * x2) / np.square(1.0 + x2)
     per_wave_number = scale * np.where([True, False, False], longitudinal, transverse)
     return per_wave_number * 2.0 * np.pi / dryden.airspeed
 
@@ -58,7 +59,8 @@ def test_the_spectra_integrate_to_the_variances() -> None:
 def test_the_time_step_is_van_loans(ratio: float) -> None:
     """C. F. Van Loan, "Computing Integrals Involving the Matrix Exponential", 1978: exp of [[-F, G G'], [0, F']] dt."""
     transition, factor = discretise_filters(ratio)
-    drift, noise = np.array([[-1.0, 0.0], [1.0, -1.0]]), np.array([[2.0, 0.0], [0.0, 0.0]])
+    drift = np.array([[-1.0, 0.0], [1.0, -1.0]])
+    noise = np.array([[2.0, 0.0], [0.0, 0.0]])
     exponential = expm(ratio * np.block([[-drift, noise], [np.zeros((2, 2)), drift.T]]))
     np.testing.assert_allclose(transition, exponential[2:, 2:].T, rtol=1e-10, atol=1e-12)
     covariance = exponential[2:, 2:].T @ exponential[:2, 2:]

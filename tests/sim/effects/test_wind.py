@@ -84,7 +84,8 @@ def test_the_wind_does_not_depend_on_how_many_steps_are_drawn_at_once(parts: tup
         change = WindChange(at=0.123, velocity=(0.0, 1.0, 0.0))
         return field(mean=(3.0, 4.0, 0.5), gusts=(gust,), turbulence=DRYDEN, changes=(change,))
 
-    pieces, source = [], make()
+    pieces = []
+    source = make()
     for steps in parts:
         pieces.append(source.advance(steps))
         assert pieces[-1].shape == (steps, 3)

@@ -55,18 +55,23 @@ def simulate(
     """
     inertia = np.array(vehicle.inertia)
     turn = Rotation.from_euler("ZYX", np.tile(np.radians(attitude[::-1]), (seeds, 1)), degrees=False)
-    p, v = np.zeros((seeds, 3)), np.zeros((seeds, 3))
+    p = np.zeros((seeds, 3))
+    v = np.zeros((seeds, 3))
     w = np.tile(np.array(rates, float), (seeds, 1))
     physics = np.zeros((seeds, len(commands) + 1, 14))
     down = np.array([0.0, 0.0, -vehicle.gravity])
     for k in range(len(commands) + 1):
-        physics[:, k, 0], physics[:, k, 1:4], physics[:, k, 8:11], physics[:, k, 11:14] = k * TIMESTEP, p, v, w
+        physics[:, k, 0] = k * TIMESTEP
+        physics[:, k, 1:4] = p
+        physics[:, k, 8:11] = v
+        physics[:, k, 11:14] = w
         physics[:, k, 4:8] = turn.as_quat(scalar_first=True)
         if k == len(commands):
             break
         wrench = vehicle.allocation @ commands[k] ** 2
         kicks = np.sqrt(TIMESTEP) * rng.standard_normal((2, seeds, 3))
-        before, spin = v, w
+        before = v
+        spin = w
         w = w + TIMESTEP * (wrench[1:] - np.cross(w, inertia * w)) / inertia
         middle = turn * Rotation.from_rotvec(0.5 * TIMESTEP * spin)
         v = v + TIMESTEP * (middle.apply([0.0, 0.0, wrench[0] / vehicle.mass]) + down)
@@ -113,7 +118,9 @@ def run(
     arrival = samples["taken"] + latency[samples["kind"]]
     filter_ = ErrorStateFilter(vehicle, assumed or sensors, settings, timestep=TIMESTEP)
     filter_.reset(motion.bias_free_mean(seed, 0), motion.commands[0], rng)
-    errors, deviations, nees = [], [], []
+    errors = []
+    deviations = []
+    nees = []
     for first in range(0, len(motion.commands), chunk):
         stop = first + chunk
         arrived = samples[(arrival > (first if first else -1)) & (arrival <= stop)]

@@ -55,7 +55,9 @@ def run(
 
 def sample(name: SensorName, value: np.ndarray, taken: int = 0) -> np.ndarray:
     samples = np.empty(1, SAMPLE)
-    samples["taken"], samples["kind"], samples["value"] = taken, KINDS[name], value
+    samples["taken"] = taken
+    samples["kind"] = KINDS[name]
+    samples["value"] = value
     return samples
 
 
@@ -80,7 +82,8 @@ def test_it_predicts(vehicle: Vehicle, grounded: bool, coupled: bool) -> None:
     """Commands that change every 4 steps, and then hold for longer than the longest prediction, 10 ms."""
     vehicle, settings = (uneven(vehicle), replace(SETTINGS, moment=True)) if coupled else (vehicle, SETTINGS)
     compiled = ErrorStateFilter(vehicle, SENSORS, settings, timestep=TIMESTEP)
-    rng, model = np.random.default_rng(1), motion_model(vehicle, settings)
+    rng = np.random.default_rng(1)
+    model = motion_model(vehicle, settings)
     for _ in range(20):
         pieces = [*[4] * 5, 10, 10, 6]
         rows = vehicle.hover_speed * rng.uniform(-0.1, 1.3, (6, 4))
@@ -100,8 +103,11 @@ def test_it_predicts(vehicle: Vehicle, grounded: bool, coupled: bool) -> None:
 
 @pytest.mark.parametrize("name", list(SensorName))
 def test_it_uses_a_sample_within_the_gate_alone(compiled: ErrorStateFilter, name: SensorName) -> None:
-    rng, kind, seen = np.random.default_rng(2), KINDS[name], set()
-    variance, gate = np.diag(np.array(compiled.struct.variance[kind])), compiled.struct.gate
+    rng = np.random.default_rng(2)
+    kind = KINDS[name]
+    seen = set()
+    variance = np.diag(np.array(compiled.struct.variance[kind]))
+    gate = compiled.struct.gate
     for _ in range(60):
         estimate = some_estimate(rng, rng.choice([0.03, 0.3]))
         value = rng.choice([0.3, 3.0]) * rng.normal(size=3)
@@ -118,13 +124,16 @@ def test_it_uses_a_sample_within_the_gate_alone(compiled: ErrorStateFilter, name
 
 @pytest.mark.parametrize("name", list(SensorName))
 def test_it_believes_a_sensor_that_it_refused_for_long(compiled: ErrorStateFilter, name: SensorName) -> None:
-    rng, kind = np.random.default_rng(3), KINDS[name]
-    variance, patience = np.diag(np.array(compiled.struct.variance[kind])), round(SETTINGS.patience / TIMESTEP)
+    rng = np.random.default_rng(3)
+    kind = KINDS[name]
+    variance = np.diag(np.array(compiled.struct.variance[kind]))
+    patience = round(SETTINGS.patience / TIMESTEP)
     value = np.array([0.4, 0.3, -2.0]) if name is SensorName.ATTITUDE else np.array([50.0, -30.0, 20.0])
     for refused in (patience - 1, patience, 2 * patience):
         estimate = some_estimate(rng, 0.01)
         track = track_of(estimate)
-        track.step, track.refused[kind] = refused, 0
+        track.step = refused
+        track.refused[kind] = 0
         run(compiled, track, sample(name, value, refused), np.empty((0, 4)), np.empty(0, np.uint8))
         if refused < patience:
             assert track.rejected[kind] == 1

@@ -56,7 +56,8 @@ def within(total: float, count: int) -> bool:
 def test_errors_and_innovations_match_the_filters_covariance(
     sensors: dict[SensorName, Sensor], motion: Any, run_filter: Callable[..., Any]
 ) -> None:
-    last, middle = [], []
+    last = []
+    middle = []
     nis = dict.fromkeys(sensors, 0.0)
     counts = dict.fromkeys(nis, 0)
     for seed in range(SEEDS):

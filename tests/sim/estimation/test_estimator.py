@@ -139,7 +139,10 @@ def test_without_samples_the_covariance_grows_and_comes_back(gentle: Any, run_fi
 def test_outliers_are_refused_and_do_no_harm(gentle: Any, run_filter: SIMULATE) -> None:
     outliers = Outliers(probability=0.1, size=100.0)
     wild = {name: replace(sensor, outliers=outliers) for name, sensor in SENSORS.items()}
-    rejected, total, clean, dirty = 0, 0, [], []
+    rejected = 0
+    total = 0
+    clean = []
+    dirty = []
     for seed in range(4):
         clean.append(run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:])
         filter_, errors, _, _ = run_filter(gentle, wild, SETTINGS, seed=seed)
@@ -218,7 +221,8 @@ def test_it_never_fails_nor_answers_with_nan(vehicle: Vehicle) -> None:
         for k in range(15):
             samples = np.empty(20, SAMPLE)
             samples["taken"] = np.repeat(range(50 * k + 10, 50 * k + 51, 10), 4)
-            samples["kind"], samples["value"] = np.tile(range(4), 5), wild * rng.standard_normal((20, 3))
+            samples["kind"] = np.tile(range(4), 5)
+            samples["value"] = wild * rng.standard_normal((20, 3))
             filter_.advance(rng.uniform(0.0, 5e3, (50, 4)), [samples])
             mean, covariance = filter_.estimate()
             assert np.isfinite(mean).all()

@@ -62,7 +62,8 @@ def test_the_mean_follows_the_plant_to_second_order(vehicle: Vehicle, model: Mot
 def test_the_covariance_moves_by_the_jacobian_of_the_mean(vehicle: Vehicle, model: MotionModel) -> None:
     rng = np.random.default_rng(0)
     driven = drive(model, vehicle.hover_speed * np.array([1.2, 1.0, 0.9, 1.0]))
-    h, step = 0.005, 1e-6
+    h = 0.005
+    step = 1e-6
     for _ in range(5):
         mean = tumbling(rng)
         after = predict_estimate(model, Estimate(mean=mean, covariance=np.eye(15)), driven, h)
@@ -92,9 +93,12 @@ def test_the_noise_that_gathers_is_van_loans(vehicle: Vehicle) -> None:
         model, Estimate(mean=rest, covariance=np.zeros((15, 15))), drive(model, np.zeros(4)), h
     ).covariance
     # Without thrust at rest: two double integrators and a walk.  Van Loan, IEEE TAC 23 (1978).
-    A, Q = np.zeros((15, 15)), np.zeros((15, 15))
+    A = np.zeros((15, 15))
+    Q = np.zeros((15, 15))
     A[0:3, 3:6] = A[6:9, 9:12] = np.eye(3)
-    Q[3:6, 3:6], Q[9:12, 9:12], Q[12:, 12:] = 0.09 * np.eye(3), 4.0 * np.eye(3), 0.01 * np.eye(3)
+    Q[3:6, 3:6] = 0.09 * np.eye(3)
+    Q[9:12, 9:12] = 4.0 * np.eye(3)
+    Q[12:, 12:] = 0.01 * np.eye(3)
     both = expm(h * np.block([[-A, Q], [np.zeros((15, 15)), A.T]]))
     np.testing.assert_allclose(result, both[15:, 15:].T @ both[:15, 15:], rtol=1e-9, atol=1e-18)
 

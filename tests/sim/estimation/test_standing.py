@@ -66,7 +66,8 @@ def test_who_stands_keeps_the_pose_and_has_no_motion(model: MotionModel, estimat
     assert np.array_equal(after.mean[retained], estimate.mean[retained])
     assert np.array_equal(np.delete(after.mean, retained), np.zeros(6))
 
-    pose, motion = [0, 1, 2, 6, 7, 8, 12, 13, 14], [3, 4, 5, 9, 10, 11]
+    pose = [0, 1, 2, 6, 7, 8, 12, 13, 14]
+    motion = [3, 4, 5, 9, 10, 11]
     assert np.array_equal(
         after.covariance[np.ix_(motion, motion)], np.diag(np.repeat([STILL_VELOCITY**2, STILL_RATE**2], 3))
     )
@@ -77,7 +78,8 @@ def test_who_stands_keeps_the_pose_and_has_no_motion(model: MotionModel, estimat
 
 
 def test_standing_is_the_same_in_one_step_and_in_many(model: MotionModel, estimate: Estimate) -> None:
-    once, often = stand(model, estimate, 0.5), estimate
+    once = stand(model, estimate, 0.5)
+    often = estimate
     for _ in range(50):
         often = stand(model, often, 0.01)
     assert np.array_equal(often.mean, once.mean)

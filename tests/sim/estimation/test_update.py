@@ -27,7 +27,8 @@ def estimate() -> Estimate:
 
 def expected(estimate: Estimate, name: SensorName, residual: Array) -> tuple[Array, Array, float]:
     """Joseph's form of the update: error, covariance, normalised innovation squared."""
-    H, P = OBSERVATION[name], estimate.covariance
+    H = OBSERVATION[name]
+    P = estimate.covariance
     S = H @ P @ H.T + R
     K = np.linalg.solve(S, H @ P).T
     rest = np.eye(15) - K @ H
@@ -39,7 +40,8 @@ def test_the_update_is_that_of_kalman_in_josephs_form(name: SensorName, estimate
     value = SAMPLE
     if name is SensorName.ATTITUDE:
         turned = Rotation.from_quat(estimate.mean[6:10], scalar_first=True) * Rotation.from_rotvec(SAMPLE)
-        value, residual = turned.as_euler("ZYX")[::-1], SAMPLE
+        value = turned.as_euler("ZYX")[::-1]
+        residual = SAMPLE
     elif name is SensorName.RATES:
         residual = SAMPLE - estimate.mean[10:13] - estimate.mean[13:16]
     else:
@@ -127,7 +129,8 @@ def test_the_difference_is_the_error_that_was_applied(mean: np.ndarray, error: n
 
 
 def test_an_attitude_error_turns_the_body_about_its_own_axes() -> None:
-    mean, error = np.zeros(16), np.zeros(15)
+    mean = np.zeros(16)
+    error = np.zeros(15)
     mean[6:10] = Rotation.from_euler("Z", 90, degrees=True).as_quat(scalar_first=True)
     error[6] = np.radians(10.0)  # about body x, which points along world y
     expected = Rotation.from_rotvec([0.0, np.radians(10.0), 0.0]) * Rotation.from_quat(mean[6:10], scalar_first=True)
