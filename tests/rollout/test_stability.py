@@ -171,16 +171,14 @@ MARGINS = [
     ("lqr", "lag"),
     ("paper-unconstrained", "thrust"),
 ]
-SLOW_MARGINS = []
-for slower in ("paper-unconstrained", "paper-constrained"):
-    for margin in ("heading", "delay", "lag"):
-        SLOW_MARGINS.append(pytest.param(slower, margin, marks=pytest.mark.slow("stability")))
+SLOW_MARGINS = [
+    pytest.param(law, quantity, marks=pytest.mark.slow("stability"))
+    for law in ("paper-unconstrained", "paper-constrained")
+    for quantity in ("heading", "delay", "lag")
+]
 
 
-@pytest.mark.parametrize(
-    ("law", "quantity"),
-    [*MARGINS, *(pytest.param(*each, marks=pytest.mark.slow("stability")) for each in SLOW_MARGINS)],
-)
+@pytest.mark.parametrize(("law", "quantity"), [*MARGINS, *SLOW_MARGINS])
 def test_the_loop_loses_its_stability_where_the_eigenvalues_say(law: str, quantity: str) -> None:
     exponent_of, low, high = THEORY[quantity]
     margin = first_crossing(lambda value: exponent_of(law, value), low, high)

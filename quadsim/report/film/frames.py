@@ -14,11 +14,10 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.record import FlightRecord
 from quadsim.report.flight_sentences import failure_sentences
 from quadsim.rotation import euler_to_quaternion
-from quadsim.state import EULER, POSITION, Array, tilt
+from quadsim.state import EULER, POSITION, Array, Indices, tilt
 from quadsim.ties import in_order
 from quadsim.vehicle import Vehicle
 
-Indices = np.ndarray[Any, np.dtype[np.intp]]
 _CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
 _LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis
 _TOLERANCE: Final = 0.03  # how far a drawn path may be from the real one, in arm lengths
