@@ -14,9 +14,10 @@ WHITE: Final = "#f0f3f6"
 GREY: Final = "#9ea8b2"
 FAINT: Final = "#4a525c"
 
-_TEXTS: Final = 2048
+_MOST_CACHED: Final = 2048
 """Texts that are cached as pictures, of each size of font: a film shows most of its words in every frame."""
-_SHADE: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
+_SHADED: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
+"""What each brightness becomes behind a text."""
 
 
 class Painter:
@@ -28,35 +29,38 @@ class Painter:
 
     def text(self, x: float, y: float, text: str, *, size: float = 15, colour: str = WHITE, anchor: str = "la") -> None:
         """Write at a place; `anchor` is Pillow's, `ra` for right-aligned."""
-        font = _font(max(6, round(size * self._scale)))
+        font = _font(_real_size(size, self._scale))
         self._canvas.text((x * self._scale, y * self._scale), text, fill=colour, font=font, anchor=anchor)
 
     def box(self, x: float, y: float, width: float, height: float, colour: str) -> None:
         """Fill a rectangle; a negative width or height reaches to the left or up."""
-        left, right = sorted((x * self._scale, (x + width) * self._scale))
-        top, bottom = sorted((y * self._scale, (y + height) * self._scale))
-        self._canvas.rectangle(
-            (round(left), round(top), max(round(right) - 1, round(left)), max(round(bottom) - 1, round(top))),
-            fill=colour,
-        )
+        left, right = sorted((round(x * self._scale), round((x + width) * self._scale)))
+        top, bottom = sorted((round(y * self._scale), round((y + height) * self._scale)))
+        corners = (left, top, max(right - 1, left), max(bottom - 1, top))
+        self._canvas.rectangle(corners, fill=colour)
 
 
 def shade(frame: Picture, x: float, y: float, width: float, height: float, *, scale: float) -> None:
     """Darken a rectangle of a frame, in place, so that text on it can be read."""
     rows = slice(round(y * scale), round((y + height) * scale))
     columns = slice(round(x * scale), round((x + width) * scale))
-    frame[rows, columns] = _SHADE.take(frame[rows, columns])
+    frame[rows, columns] = _SHADED.take(frame[rows, columns])
 
 
-@functools.lru_cache(maxsize=_TEXTS)
+@functools.lru_cache(maxsize=_MOST_CACHED)
 def text_width(text: str, size: float, *, scale: float) -> float:
     """How long a text is [design pixels]."""
-    return _font(max(6, round(size * scale))).getlength(text) / scale
+    return _font(_real_size(size, scale)).getlength(text) / scale
+
+
+def _real_size(size: float, scale: float) -> int:
+    """The size of a font [pixels], large enough to be read."""
+    return max(6, round(size * scale))
 
 
 @functools.lru_cache(maxsize=32)
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     font = ImageFont.load_default(size)
     if isinstance(font, ImageFont.FreeTypeFont):  # else it is Pillow's own bitmap, which takes no time
-        font.getmask2 = functools.lru_cache(maxsize=_TEXTS)(font.getmask2)  # type: ignore[assignment,method-assign]
+        font.getmask2 = functools.lru_cache(maxsize=_MOST_CACHED)(font.getmask2)  # type: ignore[assignment,method-assign]
     return font
