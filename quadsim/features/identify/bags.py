@@ -63,7 +63,8 @@ def _rows(path: Path, bag: Any, topic: str, names: Sequence[str]) -> list[list[f
         t = 1e-9 * arrived
         if stamp is not None:
             t = stamp.sec + 1e-9 * stamp.nanosec
-        rows.append([t, *(_at(path, message, name) for name in names)])
+        numbers = [_at(path, message, name) for name in names]
+        rows.append([t, *numbers])
     return rows
 
 

@@ -107,7 +107,10 @@ def _event_type(reader: _Reader) -> _EventType:
     """The variables of an event type, behind its number: their names end in a letter of `struct` in brackets."""
     reader.text()  # the name of the event
     (size,) = reader.unpack(_UINT16)
-    variables = [reader.text() for _ in range(size)]
-    letters = "".join(variable[-2] for variable in variables)
-    names = [variable[: -len("(f)")] for variable in variables]
-    return _EventType(names, struct.Struct(f"<{letters}"), [])
+    names = []
+    layout = "<"
+    for _ in range(size):
+        variable = reader.text()
+        names.append(variable[: -len("(f)")])
+        layout += variable[-2]
+    return _EventType(names, struct.Struct(layout), [])

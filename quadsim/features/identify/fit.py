@@ -168,9 +168,14 @@ def _vehicle(judgement: JudgedFit, values: Mapping[str, float]) -> Vehicle:
         if name in VEHICLE_UNITS and name != "body_drag" and name in values:
             changes[name] = values[name]
     for field, axes in VECTORS.items():
-        names = [f"{field}_{axis}" for axis in axes]
-        if known & {*names}:
-            changes[field] = tuple(values.get(name, number_in(start, name) or 0.0) for name in names)
+        vector = []
+        is_known = False
+        for axis in axes:
+            name = f"{field}_{axis}"
+            vector.append(values.get(name, number_in(start, name) or 0.0))
+            is_known = is_known or name in known
+        if is_known:
+            changes[field] = tuple(vector)
     if "body_drag" in known:
         areas: Array = np.array(start.body_drag or DRAG_AREAS)
         changes["body_drag"] = tuple((values["body_drag"] * areas / areas[0]).tolist())

@@ -350,7 +350,10 @@ def _surprises(known: Identification, period: float, shape: tuple[int, int], rng
     """(*shape, 6) increments on top of those that are expected, drawn from the identified noise."""
     if not known.noise:
         return np.zeros((*shape, len(INCREMENTS)))
-    drawn = [noise.surprises(rng.standard_normal(shape), period) for noise in known.noise]
+    drawn = []
+    for noise in known.noise:
+        white = rng.standard_normal(shape)
+        drawn.append(noise.surprises(white, period))
     return np.stack(drawn, axis=-1)
 
 

@@ -113,6 +113,8 @@ class IdentifiedVehicle(Tabular):
     def tables(self) -> tuple[Grid, Grid, Grid]:
         """Return the parameters, the disturbance, and the errors of the prediction."""
         known = self.identification
+        parameter_lines = tuple(_parameter(estimate, known) for estimate in known.estimates)
+        disturbance_lines = tuple(_disturbance(estimate) for estimate in known.disturbance)
         note = ""
         if known.whiteness:
             white = ", ".join(f"{axis} {value:.2f}" for axis, value in known.whiteness.items())
@@ -121,14 +123,14 @@ class IdentifiedVehicle(Tabular):
             key="parameters",
             title="Parameters",
             head=("parameter", "unit", "start", "estimate", "95 % interval", "verdict"),
-            lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
+            lines=parameter_lines,
             note=note,
         )
         disturbance = Grid(
             key="disturbance",
             title="Disturbance",
             head=("not modelled", "unit", "deviation", "95 % interval", "lasts [s]", "95 % interval", "verdict"),
-            lines=tuple(_disturbance(estimate) for estimate in known.disturbance),
+            lines=disturbance_lines,
             note="Random torque about body axes and force along world axes, wind's included. It is forgotten with the "
             "time constant in seconds.",
         )
@@ -277,6 +279,7 @@ def identify_logs(
         notes += log.notes
     _refuse_same_flights([*fitted, *tested])
     names = tuple(log.record.name for log in fitted)
+    tested_names = tuple(log.record.name for log in tested)
     with fitting_errors(", ".join(names)):
         identification, prediction = _fit_and_predict(fitted, tested, start, vehicle, wind=wind)
     if prediction.lost and not anyway:
@@ -286,7 +289,7 @@ def identify_logs(
         prediction=prediction,
         notes=tuple(notes),
         logs=names,
-        test=tuple(log.record.name for log in tested),
+        test=tested_names,
         content=vehicle_text(identification, start, names),
         file=file,
         page=page,

@@ -115,7 +115,8 @@ def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
 
 def _best(blocks: Sequence[Moments], arms: Array) -> Array:
     """Share (K,) of roll and pitch acceleration that arms (2, 4) explain in each block, at the best lag."""
-    return max((_explained(of_lag, arms) for of_lag in blocks), key=lambda shares: float(shares.mean()))
+    by_lag = [_explained(of_lag, arms) for of_lag in blocks]
+    return max(by_lag, key=lambda shares: float(shares.mean()))
 
 
 def _explained(blocks: Moments, arms: Array) -> Array:

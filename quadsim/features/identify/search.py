@@ -259,7 +259,10 @@ class Search:
         numbers |= self.fixed
         numbers.setdefault("throttle_curve", self.vehicle.throttle_share)
         for name, axes in {**VECTORS, "offset": "xy"}.items():
-            numbers[name] = np.array([numbers.pop(f"{name}_{axis}") for axis in axes])
+            vector = []
+            for axis in axes:
+                vector.append(numbers.pop(f"{name}_{axis}"))
+            numbers[name] = np.array(vector)
         areas = self.vehicle.body_drag or DRAG_AREAS
         numbers["body_drag"] = numbers["body_drag"] / areas[0] * np.array(areas)
         if len(self._winds[index]):

@@ -147,8 +147,9 @@ def _time(path: Path, columns: Mapping[str, pa.ChunkedArray], column_map: Sequen
         if name in columns:
             t = _numbers(path, name, columns[name])
             return t * _unit_of_time(t)
-    allowed = [*(named.columns[0] for named in _TIMES), *_TIMES_OF_ANY_UNIT]
-    raise FileError(path, f"lacks a column of time: one of {', '.join(allowed)}; it has {listed(columns)}{MAP_ADVICE}")
+    names = [named.columns[0] for named in _TIMES]
+    allowed = ", ".join([*names, *_TIMES_OF_ANY_UNIT])
+    raise FileError(path, f"lacks a column of time: one of {allowed}; it has {listed(columns)}{MAP_ADVICE}")
 
 
 def _unit_of_time(t: Array) -> float:
