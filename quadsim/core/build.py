@@ -123,10 +123,12 @@ def compiler() -> list[str]:
         return system_compiler()
     platform = to_publish()
     if importlib.util.find_spec("ziglang") is None:
-        lacking = f"{PLATFORM} needs the package" if platform else f"no C compiler ({', '.join(COMPILERS)}), nor"
-        raise CompilationError(f"{lacking} {ZIG}")
-    # Without either, zig compiles for the processor at hand.
-    target = ("-target", ZIG_TARGETS[platform]) if platform else ("-mcpu=baseline",)
+        if platform:
+            raise CompilationError(f"{PLATFORM} needs the package {ZIG}")
+        raise CompilationError(f"no C compiler ({', '.join(COMPILERS)}), nor {ZIG}")
+    target: tuple[str, ...] = ("-mcpu=baseline",)  # zig compiles for the processor at hand by default
+    if platform:
+        target = ("-target", ZIG_TARGETS[platform])
     return [sys.executable, "-m", "ziglang", "cc", *target]
 
 

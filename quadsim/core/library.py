@@ -53,5 +53,7 @@ def _loaded(root: Path) -> ctypes.CDLL | str:
 
 def remedy(root: Path) -> str:
     """Return the command that compiles the library; pip fetches a compiler where there is none."""
-    checkout = (root / "hatch_build.py").is_file()
-    return "run: pip install " + (f"--editable {root}" if checkout else "--force-reinstall --no-deps quadsim")
+    is_checkout = (root / "hatch_build.py").is_file()
+    if is_checkout:
+        return f"run: pip install --editable {root}"
+    return "run: pip install --force-reinstall --no-deps quadsim"

@@ -175,7 +175,9 @@ def _compiled_layout(library: ctypes.CDLL) -> dict[str, tuple[int, int]]:
 def _kind_of_member(member: Variable, structs: Mapping[str, type[Struct]]) -> Any:
     if member.pointer:
         return ctypes.c_void_p
-    kind = structs[member.type] if member.type in structs else _KINDS[member.type]
+    kind: Any = structs.get(member.type)
+    if kind is None:
+        kind = _KINDS[member.type]
     for size in reversed(member.shape):
         kind = kind * size
     return kind
