@@ -22,7 +22,8 @@ from tomlkit.items import AoT
 
 from quadsim.console.progress import Progress, silent
 from quadsim.errors import InputError, ParameterError, printable
-from quadsim.features.design.first_scenario import SHARE, FirstScenario
+from quadsim.features.design.courses_by_rule import SHARE
+from quadsim.features.design.first_scenario import FirstScenario
 from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
