@@ -3,7 +3,7 @@
 A Hummingbird is flown by a guess of its numbers and identified from the log.  Its first scenario with thrust and body
 rates is exported as C in float, which an emulated Cortex-M7 runs behind its UART.  The targets go to Betaflight's
 firmware in lockstep, whose motors drive the true vehicle; every bound is audited at 1 kHz.  It fails where one does not
-hold, or where the flight is not that of the same law in Python through the same firmware.
+hold, or where the flight is not that of the same controller in Python through the same firmware.
 """
 
 import argparse
@@ -13,7 +13,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from betaflight import BINARY, Betaflight
@@ -27,14 +26,25 @@ PROGRAMS = ("make", "arm-none-eabi-gcc", "qemu-system-arm")
 TRUE = quadsim.load_vehicle("hummingbird")
 NUMBERS = {name: value for name in VEHICLE_UNITS if (value := getattr(TRUE, name)) is not None}
 WRONG = {  # the guess over the truth; mass, arm, layout and range of speeds can be measured, and are right
-    **{"thrust_coefficient": 0.8, "inertia": 1.4, "drag_to_thrust": 0.7, "rotor_rise": 2.0, "rotor_fall": 1.2},
-    **{"rotor_inertia": 0.6, "rotor_drag": 0.5, "body_drag": 2.0},
+    "thrust_coefficient": 0.8,
+    "inertia": 1.4,
+    "drag_to_thrust": 0.7,
+    "rotor_rise": 2.0,
+    "rotor_fall": 1.2,
+    "rotor_inertia": 0.6,
+    "rotor_drag": 0.5,
+    "body_drag": 2.0,
 }
 NOISE = {"position": 0.003, "velocity": 0.03, "attitude": 0.3, "rates": 1.5}  # m, m/s, deg, deg/s, at 100 Hz
 YAW = [{"type": "setpoint", "at": 1.5 * i, "yaw": 25.0 * (-1) ** i} for i in range(1, 8)]  # s, deg
+SENSORS = {f"sensors.{name}": {"rate": 100.0, "noise": noise} for name, noise in NOISE.items()}
 EXCITATION = {
-    **{"control_period": 0.01, "reference.turns": 2.0, "events": YAW, "constraints": [], "actual": NUMBERS},
-    **{f"sensors.{name}": {"rate": 100.0, "noise": noise} for name, noise in NOISE.items()},
+    "control_period": 0.01,
+    "reference.turns": 2.0,
+    "events": YAW,
+    "constraints": [],
+    "actual": NUMBERS,
+    **SENSORS,
 }
 APART = 1e-3  # m, of the RMS errors of C and Python
 SIGNALS = ("xy", "error", "margin.tilt")
@@ -44,7 +54,8 @@ class Steps:
     """Prints what a step took and found."""
 
     def __init__(self) -> None:
-        self._start = self._last = time.perf_counter()
+        self._start = time.perf_counter()
+        self._last = self._start
 
     def __call__(self, step: str, found: str) -> None:
         """End a step."""
@@ -59,11 +70,14 @@ class Steps:
 
 def require() -> None:
     """Exit with status 2, and what installs it, where the firmware, the compiler or the emulator is missing."""
-    missing = {} if BINARY.exists() else {"Betaflight's firmware": "make betaflight"}
-    missing |= {name: "make firmware" for name in PROGRAMS if shutil.which(name) is None}
+    missing = []
+    if not BINARY.exists():
+        missing.append("Betaflight's firmware (make betaflight)")
+    for name in PROGRAMS:
+        if shutil.which(name) is None:
+            missing.append(f"{name} (make firmware)")
     if missing:
-        needed = ", ".join(f"{name} ({how})" for name, how in missing.items())
-        print(f"flight_chain.py lacks {needed}", file=sys.stderr)
+        print(f"flight_chain.py lacks {', '.join(missing)}", file=sys.stderr)
         sys.exit(2)
 
 
@@ -71,8 +85,13 @@ def write_guess(file: Path) -> Path:
     """Write the start file: the vehicle with wrong numbers."""
     lines = ['name = "mine"', 'description = "a Hummingbird by a guess"']
     for name, value in NUMBERS.items():
-        guess = (WRONG[name] * np.array(value)).tolist() if name in WRONG else value
-        lines += [f"[{name}]", f"value = {json.dumps(guess)}", f'unit = "{VEHICLE_UNITS[name]}"', 'source = "a guess"']
+        guess = value
+        if name in WRONG:
+            guess = (WRONG[name] * np.array(value)).tolist()
+        lines.append(f"[{name}]")
+        lines.append(f"value = {json.dumps(guess)}")
+        lines.append(f'unit = "{VEHICLE_UNITS[name]}"')
+        lines.append('source = "a guess"')
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return file
 
@@ -83,11 +102,11 @@ def error(flight: quadsim.Flight) -> float:
 
 
 def fly(directory: Path) -> tuple[quadsim.Flight, quadsim.Flight]:
-    """Go all the way; the flight of the chain, and that of the same law in Python."""
+    """Return the flight through the whole chain, and that of the same controller in Python."""
     step = Steps()
     guess = write_guess(directory / "start.toml")
-    course: dict[str, Any] = {"course": "figure-eight", "controller": "geometric"}
-    excited = quadsim.scenario(vehicle=guess, **course).scenario.replace(EXCITATION)
+    start = quadsim.scenario(vehicle=guess, course="figure-eight", controller="geometric").scenario
+    excited = start.replace(EXCITATION)
     log = quadsim.fly(excited, progress=False)
     log.write_tables(directory / "log")
     step("log", f"{log.time.size} samples, {log.time[-1]:.1f} s")
@@ -96,9 +115,10 @@ def fly(directory: Path) -> tuple[quadsim.Flight, quadsim.Flight]:
     found = quadsim.identify(directory / "log", vehicle=guess, out=identified)
     step("identify", f"{found.counted}\n{'':20}{found.prediction.verdict}")
 
-    made = quadsim.scenario(vehicle=identified, **course | {"controller": "rates"}).scenario
+    made = quadsim.scenario(vehicle=identified, course="figure-eight", controller="rates").scenario
     parts = assemble(made.replace({"actual": NUMBERS}))
-    parts.user_autopilot = firmware = Betaflight(parts.vehicle, parts.autopilot)
+    firmware = Betaflight(parts.vehicle, parts.autopilot)
+    parts.user_autopilot = firmware
     lags = parts.inner_lag
     first = parts.scenario.replace({"controller.inner_lag": lags})
     (directory / "first.toml").write_text(first.to_toml(), encoding="utf-8")
@@ -111,9 +131,11 @@ def fly(directory: Path) -> tuple[quadsim.Flight, quadsim.Flight]:
 
     flight = quadsim.fly_exported(first, precision="float", target=TARGET, autopilot=firmware, progress=False)
     flight.write_tables(directory / "flight")
-    margins = ", ".join(f"{f.limit.name} {f.margin:.3g} {f.limit.unit}" for f in flight.findings)
+    margins = []
+    for finding in flight.findings:
+        margins.append(f"{finding.limit.name} {finding.margin:.3g} {finding.limit.unit}")
     step("flight", f"{flight.solver}: {flight.outcome}, RMS error {100.0 * error(flight):.2f} cm")
-    print(f"{'':20}margins: {margins}")
+    print(f"{'':20}margins: {', '.join(margins)}")
 
     python = quadsim.fly(first, autopilot=firmware, progress=False)
     step("Python", f"{python.outcome}, RMS error {100.0 * error(python):.2f} cm")
@@ -133,8 +155,9 @@ def main() -> None:
     if directory is not None and directory.exists():
         parser.error(f"{directory} exists; name a directory that does not")
     with tempfile.TemporaryDirectory() as scratch:
-        (place := directory or Path(scratch)).mkdir(parents=True, exist_ok=True)
-        flight, python = fly(place)
+        folder = directory or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        flight, python = fly(folder)
     if flight.outcome != "satisfied" or not abs(error(flight) - error(python)) <= APART:
         sys.exit(f"not as required: {flight.outcome}, RMS errors {error(flight):.4f} and {error(python):.4f} m")
 

@@ -37,7 +37,10 @@ class Terminal:
     def receive(self, count: int, patience: float = 5.0) -> bytes:
         """`count` bytes; fewer where none comes within the timeout."""
         data = b""
-        while len(data) < count and select.select([self.line], [], [], patience)[0]:
+        while len(data) < count:
+            readable, _, _ = select.select([self.line], [], [], patience)
+            if not readable:
+                break
             data += os.read(self.line, count - len(data))
         return data
 
@@ -57,13 +60,13 @@ def main() -> None:
         terminal = Terminal(directory / "serial.elf")
         computer = SerialMPC(terminal, Frames("double"))
 
-        def law(now: quadsim.StepInputs, state: Array, reference: Array) -> Array:
+        def controller(now: quadsim.StepInputs, state: Array, reference: Array) -> Array:
             assert now.acting is not None
             if now.time <= 0.0:
                 computer.reset(now.acting)
             return computer.step(now.time, state, reference, now.acting).command
 
-        flight = quadsim.fly(scenario, controller=law, progress=False)
+        flight = quadsim.fly(scenario, controller=controller, progress=False)
         terminal.close()
     print(f"{flight.outcome}: {len(flight.command)} commands over the line, the last {flight.command[-1].round(2)}")
 

@@ -93,7 +93,9 @@ def forward(layers: Layers, inputs: Array) -> list[Array]:
     for i in range(0, len(layers), 2):
         output = values[-1] @ layers[i] + layers[i + 1]
         is_last = i == len(layers) - 2
-        values.append(output if is_last else np.tanh(output))
+        if not is_last:
+            output = np.tanh(output)
+        values.append(output)
     return values
 
 
@@ -112,12 +114,16 @@ def make_layers(rng: np.random.Generator, sizes: Sequence[int], last_gain: float
     """Return orthogonal weights with a gain of sqrt(2), or `last_gain` in the last layer, and biases of zero."""
     layers: Layers = []
     for i in range(len(sizes) - 1):
-        rows, columns = sizes[i], sizes[i + 1]
-        orthogonal = np.linalg.qr(rng.standard_normal((max(rows, columns), min(rows, columns))))[0]
+        rows = sizes[i]
+        columns = sizes[i + 1]
+        orthogonal, _ = np.linalg.qr(rng.standard_normal((max(rows, columns), min(rows, columns))))
         if rows < columns:
             orthogonal = orthogonal.T
-        gain = last_gain if i == len(sizes) - 2 else np.sqrt(2.0)
-        layers += [(gain * orthogonal).astype(np.float32), np.zeros(columns, np.float32)]
+        gain = np.sqrt(2.0)
+        if i == len(sizes) - 2:
+            gain = last_gain
+        layers.append((gain * orthogonal).astype(np.float32))
+        layers.append(np.zeros(columns, np.float32))
     return layers
 
 
@@ -125,7 +131,8 @@ class Adam:
     """Gradient descent with momentum and a step size for each parameter (Kingma and Ba, 2015, arXiv:1412.6980)."""
 
     def __init__(self, parameters: Layers, largest_gradient: float) -> None:
-        self.parameters, self.largest_gradient = parameters, largest_gradient
+        self.parameters = parameters
+        self.largest_gradient = largest_gradient
         self.mean = [np.zeros_like(parameter) for parameter in parameters]
         self.square = [np.zeros_like(parameter) for parameter in parameters]
         self.count = 0
@@ -147,7 +154,9 @@ class Moments:
     """Running mean and variance of observations (n,)."""
 
     def __init__(self, size: int) -> None:
-        self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 1e-4
+        self.mean = np.zeros(size)
+        self.variance = np.ones(size)
+        self.count = 1e-4
 
     def include(self, observations: Array) -> None:
         """Include observations (K, n) (Chan, Golub and LeVeque, 1983)."""
@@ -185,7 +194,8 @@ class Learner:
 
     def __init__(self, envs: VectorEnv, settings: Settings) -> None:
         """Set up networks, and reset the environments."""
-        self.envs, self.settings = envs, settings
+        self.envs = envs
+        self.settings = settings
         self.rng = np.random.default_rng(settings.seed)
         self.observed, _ = envs.reset(seed=settings.seed)
         size = self.observed.shape[1]
@@ -199,9 +209,11 @@ class Learner:
 
     def policy(self) -> Policy:
         """Return the policy as learned so far, without exploration."""
-        pairs = tuple((self.actor[i].copy(), self.actor[i + 1].copy()) for i in range(0, len(self.actor), 2))
+        layers = []
+        for i in range(0, len(self.actor), 2):
+            layers.append((self.actor[i].copy(), self.actor[i + 1].copy()))
         deviation = np.sqrt(self.moments.variance + 1e-8)
-        return Policy(mean=self.moments.mean.copy(), deviation=deviation, layers=pairs)
+        return Policy(mean=self.moments.mean.copy(), deviation=deviation, layers=tuple(layers))
 
     def learn(self, updates: int, *, report: bool = True) -> None:
         """Fly and update; the learning rate falls over these updates."""
@@ -272,9 +284,9 @@ class Learner:
         advantages = self.advantages(rollout)
         returns = np.ravel(advantages + np.array(rollout.values[:-1])).astype(np.float32)
         advantages = advantages.ravel().astype(np.float32)
-        inputs, actions, before = (
-            np.concatenate(parts) for parts in (rollout.inputs, rollout.actions, rollout.log_probabilities)
-        )
+        inputs = np.concatenate(rollout.inputs)
+        actions = np.concatenate(rollout.actions)
+        before = np.concatenate(rollout.log_probabilities)
         for _ in range(self.settings.epochs):
             order = self.rng.permutation(len(inputs))
             for first in range(0, len(order), self.settings.minibatch):
@@ -300,8 +312,8 @@ class Learner:
 
     def note(self, rollout: Rollout) -> None:
         """Add a point to the learning curve."""
-        steps = len(self.curve) + 1
-        steps *= self.settings.environments * self.settings.length
+        updates = len(self.curve) + 1
+        steps = updates * self.settings.environments * self.settings.length
         self.curve.append(
             CurvePoint(
                 steps=steps,
@@ -328,19 +340,25 @@ def fly_campaigns(policy: Path, out: Path, flights: int) -> list[Score]:
 
 def score(controller: str, table: Any) -> Score:
     """Return the score of a campaign's table."""
-    columns = {name: np.array(table[name].to_pylist()) for name in ("verdict", "violated", "peak_tilt")}
-    upright = [np.array(table[f"satisfied.{axis}"].to_pylist(), bool) for axis in ("roll", "pitch")]
-    squares = [np.square(np.array(table[f"rmse.{axis}"].to_pylist(), float)) for axis in "xyz"]
+    verdicts = np.array(table["verdict"].to_pylist())
+    violated = np.array(table["violated"].to_pylist())
+    tilts = np.array(table["peak_tilt"].to_pylist())
+    roll_held = np.array(table["satisfied.roll"].to_pylist(), bool)
+    pitch_held = np.array(table["satisfied.pitch"].to_pylist(), bool)
+    squares = []
+    for axis in "xyz":
+        rms = np.array(table[f"rmse.{axis}"].to_pylist(), float)
+        squares.append(np.square(rms))
     errors = np.sqrt(np.sum(squares, axis=0))
     return Score(
         controller=controller,
         flights=table.num_rows,
-        lost=int(np.sum(columns["verdict"] == "lost")),
-        violated=int(np.sum(columns["violated"])),
-        tilted=int(np.sum(~np.logical_and(*upright))),
+        lost=int(np.sum(verdicts == "lost")),
+        violated=int(np.sum(violated)),
+        tilted=int(np.sum(~np.logical_and(roll_held, pitch_held))),
         error=float(np.sqrt(np.mean(errors**2))),
         largest_error=float(errors.max()),
-        peak_tilt=float(columns["peak_tilt"].max()),
+        peak_tilt=float(tilts.max()),
     )
 
 
@@ -367,7 +385,13 @@ def write_csv(path: Path, rows: Sequence[CurvePoint | Score]) -> None:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(asdict(rows[0]))
         for row in rows:
-            lines.writerow(f"{value:.4g}" if isinstance(value, float) else value for value in asdict(row).values())
+            cells = []
+            for value in asdict(row).values():
+                if isinstance(value, float):
+                    cells.append(f"{value:.4g}")
+                else:
+                    cells.append(value)
+            lines.writerow(cells)
 
 
 def read_curve(path: Path) -> list[CurvePoint]:

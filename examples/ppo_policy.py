@@ -49,7 +49,9 @@ class Policy:
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
-        layers = [{"weights": rounded(weights), "bias": rounded(bias)} for weights, bias in self.layers]
+        layers = []
+        for weights, bias in self.layers:
+            layers.append({"weights": rounded(weights), "bias": rounded(bias)})
         data = {"mean": rounded(self.mean), "deviation": rounded(self.deviation), "layers": layers}
         path.write_text(json.dumps(data) + "\n", encoding="utf-8")
 
@@ -57,8 +59,10 @@ class Policy:
     def load(path: Path) -> Policy:
         """Read what `save` wrote."""
         data = json.loads(path.read_text(encoding="utf-8"))
-        layers = tuple((np.array(layer["weights"]), np.array(layer["bias"])) for layer in data["layers"])
-        return Policy(mean=np.array(data["mean"]), deviation=np.array(data["deviation"]), layers=layers)
+        layers = []
+        for layer in data["layers"]:
+            layers.append((np.array(layer["weights"]), np.array(layer["bias"])))
+        return Policy(mean=np.array(data["mean"]), deviation=np.array(data["deviation"]), layers=tuple(layers))
 
 
 def rounded(array: Array) -> Any:

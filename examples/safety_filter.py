@@ -37,24 +37,36 @@ def filtered_air(name: str) -> quadsim.Scenario:
     return quadsim.load(name).replace({"controller": CONTROLLER, "constraints": [tilt]})
 
 
+def fly(name: str, *, filtered: bool) -> None:
+    """Fly one episode by random actions, and print how it went."""
+    env: gymnasium.Env[np.ndarray, np.ndarray] = quadsim.gym.make_env(filtered_air(name))
+    if filtered:
+        env = quadsim.gym.MPCSafetyFilter(env)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    steps = 0
+    largest = 0.0
+    terminated = False
+    truncated = False
+    while not (terminated or truncated):
+        _, _, terminated, truncated, info = env.step(env.action_space.sample())
+        steps += 1
+        largest = max(largest, LARGEST - info["margins"]["tilt"])
+    outcome = "flown"
+    if terminated:
+        outcome = "lost"
+    filtering = "no filter"
+    if isinstance(env, quadsim.gym.MPCSafetyFilter):
+        filtering = f"stepped in {env.interventions} times"
+    print(f"{name}: {steps} steps, tilt up to {largest:.2f} deg, {outcome}; {filtering}")
+    env.close()
+
+
 def main(names: list[str]) -> None:
     """One episode of each, with the filter and without."""
     for name in names or AIR:
-        for filtered in (True, False):
-            env: gymnasium.Env[np.ndarray, np.ndarray] = quadsim.gym.make_env(filtered_air(name))
-            if filtered:
-                env = quadsim.gym.MPCSafetyFilter(env)
-            env.reset(seed=0)
-            env.action_space.seed(0)
-            steps, largest, terminated, truncated = 0, 0.0, False, False
-            while not (terminated or truncated):
-                _, _, terminated, truncated, info = env.step(env.action_space.sample())
-                steps, largest = steps + 1, max(largest, LARGEST - info["margins"]["tilt"])
-            how = (
-                f"stepped in {env.interventions} times" if isinstance(env, quadsim.gym.MPCSafetyFilter) else "no filter"
-            )
-            print(f"{name}: {steps} steps, tilt up to {largest:.2f} deg, {'lost' if terminated else 'flown'}; {how}")
-            env.close()
+        fly(name, filtered=True)
+        fly(name, filtered=False)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ from itertools import product
 from typing import Final
 
 from quadsim.assets import vehicle_names, vehicle_path
-from quadsim.features.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
+from quadsim.features.design.courses_by_rule import COURSES
+from quadsim.features.design.first_scenario import DESIGNED_LAWS, first_scenario
 from quadsim.features.design.plausible_vehicles import plausible_vehicles
 from quadsim.flight.metrics import peak_tilt, tracking
 from quadsim.rollout.rollout import Rollout

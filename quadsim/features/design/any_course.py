@@ -1,19 +1,9 @@
-"""A course of the library, of a scenario file or of a table, made for a vehicle.
+"""A course of the library, of a scenario file or of a table, scaled for a vehicle.
 
-What of a scenario is its course: `[reference]`, where it starts, obstacles, corridors, the fence, the ground, and the
-constraints on position, velocity, heading and their errors.  All of it scales by the units of its fields
-(`quadsim.scenarios.scaling`):
-
-- *Lengths* by the vehicles' bounding balls, so that a gap is as many vehicles wide as before; those of a table, or of
-  a scenario file of the same vehicle, stay.
-- *Times* such that the course asks for `SHARE` of the vehicle's limits: of the acceleration within the tilt bound, of
-  climb and sink, of the fastest level speed, of the rates at which its loops follow, and of its turning.  Among
-  obstacles it asks for no more acceleration than is stated: what it takes to avoid them is not known beforehand.
-- *Heights* such that the lowest point keeps the allowed error, and the hull, above the ground.
-- *Errors* by lengths, but to no less than what the vehicle's own figure eight is allowed; those stated for the same
-  vehicle stay.
-
-Wind, faults, sensors and events are no part of a course; what is left out is named in the file.
+Lengths are scaled by the vehicles' bounding balls, so that a gap is as many vehicles wide as before; times such that
+the course asks for `SHARE` of each limit of the vehicle (`_share`); heights are raised until the lowest point keeps the
+allowed error and the hull above the ground.  Fields are scaled by their units (`quadsim.scenarios.scaling`).  The
+result is a `FirstCourse` for `first_scenario.py`; what is no part of a course is left out and named in the file.
 """
 
 from __future__ import annotations
@@ -28,10 +18,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from quadsim.errors import ParameterError, UnknownNameError
-from quadsim.features.design.first_scenario import (
+from quadsim.features.design.courses_by_rule import (
     ALLOWED_SHARE,
     COURSES,
-    DESIGNED_LAWS,
     EIGHT_RATIO,
     HEIGHT_OVER_ERROR,
     SHARE,
@@ -43,16 +32,20 @@ from quadsim.features.design.first_scenario import (
     later,
     lowest_centre,
     require_size,
+    size_option,
     step_bandwidth,
 )
+from quadsim.features.design.first_scenario import DESIGNED_LAWS
 from quadsim.features.design.rules import HEADING_STEP, Design, design_for
 from quadsim.flight.audit import Limit
 from quadsim.mpc.space import Avoidance
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.courses.course import Course
 from quadsim.scenarios.courses.csv_course import Csv, read_course_table
 from quadsim.scenarios.courses.smoothing import within_rounding
 from quadsim.scenarios.courses.steps import Steps
+from quadsim.scenarios.courses.table import ReferenceTable
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.scaling import Scale, scaled_limit, scaled_table
 from quadsim.scenarios.schema.scenario import Scenario
@@ -61,14 +54,14 @@ from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import Vehicle
 
 _REST: Final = 1.0  # after the end of a table [s]
-_SAMPLES: Final = 4000  # of a course, by which its demands are found
+_SAMPLES: Final = 4000  # of a course, from which its demands are computed
 _SHARPEST: Final = 0.05
-"""Change of velocity between two samples, over the largest velocity, that is a corner and not a bend."""
+"""Change of velocity between two samples, over the largest velocity, that counts as a corner."""
 _FREQUENCY_RATIO: Final = 1.5 * EIGHT_RATIO
 """Largest acceleration over largest speed of a course [rad/s], over w: of a figure eight 1.5 times its turns."""
-_SLOWEST = 1e-3
-_FASTEST = 1e3
-"""Range in which the factor of times is looked for."""
+_LEAST_FACTOR = 1e-3
+_LARGEST_FACTOR = 1e3
+"""Range of the factor of times."""
 _HALVINGS: Final = 40
 _YAW_ALLOWED: Final = 90.0 * ALLOWED_SHARE
 """Least allowed error of the heading [deg]: that of a quarter turn."""
@@ -78,9 +71,8 @@ _ERRORS: Final = tuple(f"{name}_error" for name in REFERENCE_NAMES)
 _CARRIED: Final = ("x", "y", "z", "vx", "vy", "vz", *_ERRORS)
 """Signals of the constraints that belong to a course."""
 _BOUNDED: Final = ("roll", "pitch", "speed", "slew")
-"""Signals that the new controller bounds itself: an entry of the old one is not missed."""
-_RESERVED: Final = _BOUNDED
-"""Names of constraints that the new scenario gives itself."""
+"""Signals that the new scenario bounds itself, under these names: entries on them are not listed as left out, and
+entries of such a name are renamed."""
 _NO_COURSE: Final = ("forces", "computation", "sensors", "estimator", "events", "actual")
 """Tables that are no part of a course."""
 
@@ -92,8 +84,8 @@ def course_for(
 
     Args:
         name: one of `COURSES`; a scenario of the library, or a path to one (.toml); or a path to a table (.csv).
-        vehicle: the numbers.
-        file: where these are.
+        vehicle: its numbers.
+        file: the vehicle's file.
         law: one of `DESIGNED_LAWS`.
         tilt: bound [deg] that replaces that of the rules.
         size: longest side of the course [m]; None: by rule.
@@ -120,7 +112,8 @@ def is_trajectory(course: str) -> bool:
 
 def course_names() -> list[str]:
     """Return what `--course` takes by name: courses by rule, then the library's scenarios."""
-    return [*COURSES, *(name for name in scenario_names() if name not in COURSES)]
+    others = [name for name in scenario_names() if name not in COURSES]
+    return [*COURSES, *others]
 
 
 def fitted_course(
@@ -130,8 +123,8 @@ def fitted_course(
 
     Args:
         name: of a scenario of the library, or a path to a scenario file (.toml) or to a table (.csv).
-        vehicle: the numbers.
-        file: where these are.
+        vehicle: its numbers.
+        file: the vehicle's file.
         design: of its controller.
         avoids: whether the controller can keep clear of obstacles.
         size: longest side of the course [m]; None: by the rules of this module.
@@ -144,8 +137,8 @@ def fitted_course(
     else:
         base = load_scenario(name)
     assembly = Assembly(base)
-    _require_upright(name, base, assembly)
-    if (base.obstacles or base.regions) and not avoids:
+    _require_upright(name, base)
+    if _has_obstacles(base) and not avoids:
         rule = f"flown by --controller {' or '.join(AVOIDING)}, which keep clear of its obstacles and regions"
         raise ParameterError("", "--course", name, rule)
     own = is_trajectory(name) or (name.endswith(".toml") and _same(base, assembly, vehicle, file))
@@ -156,17 +149,41 @@ def fitted_course(
         by_extent = vehicle.enclosing_radius / assembly.vehicle.enclosing_radius
     length = _length_factor(name, samples, size, by_extent)
     time, response = _time_factor(samples, length, vehicle, design)
-    if base.obstacles or base.regions:
+    if _has_obstacles(base):  # no more acceleration than is stated: what it takes to avoid them is not known beforehand
         time = max(time, math.sqrt(length))
     allowed = ALLOWED_SHARE * eight_length(vehicle, design)
-    touches = base.effects.ground is not None and base.effects.ground.contact
     lift = 0.0
-    if not touches:
-        lowest = length * float(samples.poses[:, 2].min())
-        least = lowest_centre(vehicle) + HEIGHT_OVER_ERROR * allowed
-        lift = max(0.0, math.ceil(10.0 * (least - lowest) - 1e-6) / 10.0)
-    scale = Scale(length=in_digits(length, 4), time=in_digits(time, 4), lift=lift)
-    return _written(name, base, assembly, scale, response, allowed, samples, own=own, size=size, touches=touches)
+    if not _touches_ground(base):
+        lift = _lift(length * float(samples.poses[:, 2].min()), vehicle, allowed)
+    adaptation = Adaptation(
+        scale=Scale(length=in_digits(length, 4), time=in_digits(time, 4), lift=lift),
+        response_time=response,
+        allowed=allowed,
+        own=own,
+    )
+    return _written(name, size, base, assembly, samples, adaptation)
+
+
+def _has_obstacles(base: Scenario) -> bool:
+    """Return whether a scenario has obstacles or regions."""
+    return bool(base.obstacles or base.regions)
+
+
+def _touches_ground(base: Scenario) -> bool:
+    """Return whether a scenario's vehicle may stand on the ground."""
+    return base.effects.ground is not None and base.effects.ground.contact
+
+
+def _lift(lowest: float, vehicle: Vehicle, allowed: float) -> float:
+    """Return by how much a course is raised [m], in decimetres.
+
+    Args:
+        lowest: height of its lowest point [m].
+        vehicle: whose hull is to stay above the ground.
+        allowed: error [m].
+    """
+    least = lowest_centre(vehicle) + HEIGHT_OVER_ERROR * allowed
+    return max(0.0, math.ceil(10.0 * (least - lowest) - 1e-6) / 10.0)
 
 
 def _of_table(path: str, file: str, design: Design) -> Scenario:
@@ -186,9 +203,10 @@ def _of_table(path: str, file: str, design: Design) -> Scenario:
     return parse_scenario(tables, source=path)
 
 
-def _require_upright(name: str, base: Scenario, assembly: Assembly) -> None:
+def _require_upright(name: str, base: Scenario) -> None:
     """Refuse a course that turns or starts upside down."""
-    if base.lost.tilt is False or any(abs(angle) > 90.0 for angle in base.initial.euler[:2]):
+    roll, pitch, _ = base.initial.euler
+    if base.lost.tilt is False or max(abs(roll), abs(pitch)) > 90.0:
         rule = "one that stays upright: the designed controllers bound the tilt (copy its file, and set vehicle.file)"
         raise ParameterError("", "--course", name, rule)
 
@@ -223,6 +241,16 @@ class SampledCourse:
         return bool(np.ptp(self.poses, axis=0).max() > 0.0)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Adaptation:
+    """How a course is changed for a vehicle."""
+
+    scale: Scale  # of lengths, times and heights
+    response_time: float  # of the filter that its corners need [s]; 0: it keeps its own
+    allowed: float  # error that the vehicle's own figure eight is allowed [m]
+    own: bool  # whether the course was stated for this vehicle: its lengths and errors stay
+
+
 def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
     """Return the samples of a scenario's course, over its flight."""
     course = assembly.course
@@ -230,22 +258,17 @@ def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
     if not end > 0.0:
         end = base.duration
     t, interval = np.linspace(0.0, end, _SAMPLES, retstep=True)
-    poses = course.sample(t)
+    stated = course.sample(t)
     smooth_everywhere = np.zeros(_SAMPLES - 1, bool)
-    channels = zip(poses.T, course.resolution, strict=True)
-    poses = np.column_stack([within_rounding(values, unit, smooth_everywhere) for values, unit in channels])
-    if course.jumps:
-        before = course.sample(np.array(course.jumps) - 1e-6)
-        after = course.sample(np.array(course.jumps) + 1e-6)
-    else:
-        before = np.empty((0, 4))
-        after = np.empty((0, 4))
-    moved = after - before
+    channels = []
+    for values, resolution in zip(stated.T, course.resolution, strict=True):
+        channels.append(within_rounding(values, resolution, smooth_everywhere))
+    poses = np.column_stack(channels)
+    moved = _moved_by_jumps(course)
     has_jumps = isinstance(base.reference, Steps) and bool(np.abs(moved).max(initial=0.0) > 0.0)
+    shortest = math.inf
     if has_jumps:
-        gaps = np.diff(course.jumps)
-    else:
-        gaps = np.array([math.inf])
+        shortest = float(np.diff(course.jumps).min(initial=math.inf))
     velocity = np.diff(poses[:, :3], axis=0)
     fastest = float(np.linalg.norm(velocity, axis=1).max())
     bends = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
@@ -255,9 +278,19 @@ def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
         response_time=base.reference.response_time,
         jumps=has_jumps,
         largest_jump=float(np.abs(moved[:, :3]).max(initial=0.0)),
-        shortest=float(gaps.min(initial=math.inf)),
+        shortest=shortest,
         corners=bool(fastest > 0.0 and bends.max() > _SHARPEST * fastest),
     )
+
+
+def _moved_by_jumps(course: Course) -> Array:
+    """Return the changes (J, 4) of x, y, z [m], yaw [rad] at the jumps of a course."""
+    if not course.jumps:
+        return np.empty((0, 4))
+    times = np.array(course.jumps)
+    before = course.sample(times - 1e-6)
+    after = course.sample(times + 1e-6)
+    return after - before
 
 
 def _length_factor(name: str, samples: SampledCourse, size: float | None, by_extent: float) -> float:
@@ -282,7 +315,7 @@ def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, design
     if not samples.moves:
         return 1.0, response
 
-    def share(time: float) -> float:
+    def largest_share(time: float) -> float:
         filtered = response or time * samples.response_time
         shares = [_share(samples, length, time, filtered, vehicle, design)]
         if is_sharp and not response:
@@ -291,13 +324,13 @@ def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, design
             shares.append(1.2 * filtered / (time * samples.shortest))
         return max(shares)
 
-    return _where_one(share), response
+    return _least_factor(largest_share), response
 
 
-def _where_one(share: Callable[[float], float]) -> float:
-    """Return the least factor of times, within `_SLOWEST` to `_FASTEST`, at which a falling share is at most 1."""
-    low = math.log(_SLOWEST)
-    high = math.log(_FASTEST)
+def _least_factor(share: Callable[[float], float]) -> float:
+    """Return the least factor of times, within that range, at which a falling share is at most 1."""
+    low = math.log(_LEAST_FACTOR)
+    high = math.log(_LARGEST_FACTOR)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         if share(math.exp(middle)) > 1.0:
@@ -310,23 +343,12 @@ def _where_one(share: Callable[[float], float]) -> float:
 def _share(
     samples: SampledCourse, length: float, time: float, response_time: float, vehicle: Vehicle, design: Design
 ) -> float:
-    """Return the largest demand of a course, with factors of lengths and times, over what it may ask for."""
-    interval = time * samples.interval
-    poses = samples.poses * np.array([length, length, length, 1.0])
-    velocity = np.diff(poses, axis=0, prepend=poses[:1]) / interval
-    if response_time:
-        lag = response_time / 3.0
-        keep = math.exp(-interval / lag)
+    """Return the largest demand of a course, with factors of lengths and times, over what it may ask for.
 
-        def lagging(values: Array) -> Array:
-            start = values[0] * keep
-            return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=start[None, :])[0])
-
-        filtered = lagging(velocity)
-        acceleration = (velocity - filtered) / lag
-        velocity = filtered
-    else:
-        acceleration = np.diff(velocity, axis=0, append=velocity[-1:]) / interval
+    It may ask for `SHARE` of the fastest level speed, of the rate of turning, of the acceleration within the tilt bound
+    and of climb and sink; and for as much acceleration over its largest speed as a figure eight, `_FREQUENCY_RATIO` w.
+    """
+    velocity, acceleration = _motion(samples, length, time, response_time)
     fastest = float(np.linalg.norm(velocity[:, :3], axis=1).max())
     turning = float(np.abs(velocity[:, 3]).max())
     shares = [
@@ -336,72 +358,116 @@ def _share(
     if not samples.jumps:  # of steps the filter's bandwidth is the measure
         level = float(np.hypot(acceleration[:, 0], acceleration[:, 1]).max())
         shares.append(level / (SHARE * vehicle.gravity * design.acceleration))
-        upward = float(np.abs(acceleration[:, 2]).max())
-        shares.append(upward / (SHARE * min(design.authority.climb, design.authority.sink)))
+        vertical = float(np.abs(acceleration[:, 2]).max())
+        shares.append(vertical / (SHARE * min(design.authority.climb, design.authority.sink)))
         largest = float(np.linalg.norm(acceleration[:, :3], axis=1).max())
         if fastest > 0.0 and not samples.corners:
             shares.append(largest / fastest / (_FREQUENCY_RATIO * design.bandwidth))
     return max(shares)
 
 
+def _motion(samples: SampledCourse, length: float, time: float, response_time: float) -> tuple[Array, Array]:
+    """Return velocity and acceleration (M, 4) of a course with factors of lengths and times, behind its filter.
+
+    With a filter of first order, of time constant T = response_time / 3, v' = (v_stated - v) / T.
+    """
+    interval = time * samples.interval
+    poses = samples.poses * np.array([length, length, length, 1.0])
+    stated = np.diff(poses, axis=0, prepend=poses[:1]) / interval
+    if not response_time:
+        return stated, np.diff(stated, axis=0, append=stated[-1:]) / interval
+    lag = response_time / 3.0
+    keep = math.exp(-interval / lag)
+    start = stated[0] * keep
+    filtered, _ = lfilter([1.0 - keep], [1.0, -keep], stated, axis=0, zi=start[None, :])
+    velocity = np.asarray(filtered)
+    return velocity, (stated - velocity) / lag
+
+
 def _written(
     name: str,
+    size: float | None,
     base: Scenario,
     assembly: Assembly,
-    scale: Scale,
-    response: float,
-    allowed: float,
     samples: SampledCourse,
-    *,
-    own: bool,
-    size: float | None,
-    touches: bool,
+    adaptation: Adaptation,
 ) -> FirstCourse:
-    """Return the course as text."""
+    """Return the course as text.
+
+    Args:
+        name: of the scenario, or the path to its file or table.
+        size: stated longest side of the course [m]; None without.
+        base: the scenario.
+        assembly: the same, assembled.
+        samples: of its course.
+        adaptation: to the vehicle.
+    """
+    scale = adaptation.scale
+    allowed = adaptation.allowed
     explained: set[object] = set()
-    reference = scaled_table(base.reference, scale)
-    if response:
-        reference = replace(reference, response_time=response)
-    if isinstance(reference, Csv):
-        stated = base.tables["reference"]["file"]
-        reference = replace(reference, file=stated, sha256=None)
+    reference = _reference(base, adaptation)
     tables = _space(base, scale, explained)
-    if touches:
-        ground = base.effects.ground
-        assert ground is not None
-        has_effect = ground.effect and assembly.vehicle.rotor_radius is not None
-        tables = "\n" + "\n".join(stated_lines("[effects.ground]", replace(ground, effect=has_effect), set())) + tables
-    holds = [entry for entry in base.constraints if entry.signal in _ERRORS and entry.has_bounds]
-    entries = []
+    if _touches_ground(base):
+        tables = _ground(base, assembly) + tables
+    has_floor = _touches_ground(base)
+    required = allowed  # 0 where its own constraints limit the errors
+    constraints = ""
     for entry in base.constraints:
-        if _carries(entry):
-            entries.append(_constraint(entry, scale, allowed, own=own))
+        if _is_floor(entry):
+            has_floor = True
+        if entry.signal in _CARRIED and entry.has_bounds:
+            constraints += _constraint(entry, adaptation)
+            if entry.signal in _ERRORS:
+                required = 0.0
+    stem = Path(name).stem
+    about = stem
+    if samples.moves:
+        about += f" at {100.0 * SHARE:g} % of its limits"
     duration = None
     if not base.ends_with_course:
-        duration = later(scale.time * base.duration + response)
-    stem = Path(name).stem
+        duration = later(scale.time * base.duration + adaptation.response_time)
     return FirstCourse(
         name=stem.lower(),
-        options=f"--course {name}" + ("" if size is None else f" --size {size:g}"),
-        about=f"{stem} at {100.0 * SHARE:g} % of its limits" if samples.moves else f"{stem}",
+        options=f"--course {name}{size_option(size)}",
+        about=about,
         initial=_initial(base, scale),
         reference="\n".join(stated_lines("[reference]", reference, explained)) + "\n",
         duration=duration,
         size=scale.length * samples.size,
-        allowed=0.0 if holds else allowed,
+        allowed=required,
         why_allowed=f"{100 * ALLOWED_SHARE:g} % of its own figure eight, {in_digits(allowed / ALLOWED_SHARE):g} m",
         lasts=samples.moves and not samples.jumps,
         clearance=_clearance(base, scale),
-        has_floor=touches or any(_is_floor(entry) for entry in base.constraints),
+        has_floor=has_floor,
         tables=tables,
-        constraints="".join(entries),
-        notes=(*_scale_notes(scale, response, own=own), *_left_out(base)),
+        constraints=constraints,
+        notes=(*_scale_notes(adaptation), *_left_out(base)),
     )
+
+
+def _reference(base: Scenario, adaptation: Adaptation) -> ReferenceTable:
+    """Return the table `[reference]`, scaled and filtered; of a table of samples without its check sum."""
+    reference = scaled_table(base.reference, adaptation.scale)
+    if adaptation.response_time:
+        reference = replace(reference, response_time=adaptation.response_time)
+    if isinstance(reference, Csv):
+        stated = base.tables["reference"]["file"]
+        reference = replace(reference, file=stated, sha256=None)
+    return reference
+
+
+def _ground(base: Scenario, assembly: Assembly) -> str:
+    """Return the table of the ground; its effect on thrust needs the rotor radius of its vehicle."""
+    ground = base.effects.ground
+    assert ground is not None
+    has_effect = ground.effect and assembly.vehicle.rotor_radius is not None
+    lines = stated_lines("[effects.ground]", replace(ground, effect=has_effect), set())
+    return "\n" + "\n".join(lines) + "\n"
 
 
 def _clearance(base: Scenario, scale: Scale) -> float | None:
     """Return the clearance that the controller adds [m]: that of the scenario's, scaled, or by default."""
-    if not base.obstacles and not base.regions:
+    if not _has_obstacles(base):
         return None
     stated = vars(base.controller).get("avoidance") or Avoidance()
     return scale.number(stated.margin, "m")
@@ -410,10 +476,11 @@ def _clearance(base: Scenario, scale: Scale) -> float | None:
 def _initial(base: Scenario, scale: Scale) -> str:
     """Return the fields of `[initial]`."""
     x, y, z = base.initial.position
-    place = [scale.number(x, "m"), scale.number(y, "m"), scale.height(z)]
-    lines = [f"position = {place}  # m, world"]
-    if base.initial.euler[2]:
-        lines.append(f"euler = [0.0, 0.0, {base.initial.euler[2]}]  # deg: roll, pitch, yaw")
+    position = [scale.number(x, "m"), scale.number(y, "m"), scale.height(z)]
+    lines = [f"position = {position}  # m, world"]
+    _, _, yaw = base.initial.euler
+    if yaw:
+        lines.append(f"euler = [0.0, 0.0, {yaw}]  # deg: roll, pitch, yaw")
     if base.initial.cold:
         lines.append("cold = true  # rotors at rest")
     return "\n".join(lines) + "\n"
@@ -437,33 +504,32 @@ def _is_floor(entry: Limit) -> bool:
     return entry.signal == "z" and math.isfinite(entry.lower) and entry.start <= 0.0 and math.isinf(entry.stop)
 
 
-def _carries(entry: Limit) -> bool:
-    return entry.signal in _CARRIED and entry.has_bounds
-
-
-def _constraint(entry: Limit, scale: Scale, allowed: float, *, own: bool) -> str:
+def _constraint(entry: Limit, adaptation: Adaptation) -> str:
     """Return an entry of `[[constraints]]` at a scale; errors are allowed what the vehicle needs."""
-    limit = scaled_limit(entry, scale)
+    limit = scaled_limit(entry, adaptation.scale)
     why = "scaled with the course"
-    if entry.signal in _ERRORS and not own:
+    if entry.signal in _ERRORS and not adaptation.own:
         if entry.signal == "yaw_error":
             least = _YAW_ALLOWED
         else:
-            least = in_digits(allowed)
+            least = in_digits(adaptation.allowed)
         lower = min(limit.lower, -least)
         upper = max(limit.upper, least)
         if (lower, upper) != (limit.lower, limit.upper):
             why = f"at least what the vehicle's own figure eight is allowed, {least:g}"
         limit = replace(limit, lower=lower, upper=upper)
-    if limit.name in _RESERVED:
+    if limit.name in _BOUNDED:
         limit = replace(limit, name=f"course_{limit.name}")
-    lines = ["", *stated_lines("[[constraints]]", limit, {(Limit, name) for name in Limit.__dataclass_fields__})]
-    return "\n".join([lines[0], f"{lines[1]}  # {limit.unit}: {why}", *lines[2:]]) + "\n"
+    explained: set[object] = {(Limit, name) for name in Limit.__dataclass_fields__}  # so no comments
+    header, *fields = stated_lines("[[constraints]]", limit, explained)
+    return "\n".join(["", f"{header}  # {limit.unit}: {why}", *fields]) + "\n"
 
 
-def _scale_notes(scale: Scale, response: float, *, own: bool) -> list[str]:
+def _scale_notes(adaptation: Adaptation) -> list[str]:
     """Return lines on what was scaled."""
-    if own and scale.length == 1.0:
+    scale = adaptation.scale
+    response = adaptation.response_time
+    if adaptation.own and scale.length == 1.0:
         lengths = "as stated"
     else:
         lengths = f"times {scale.length:g}"
@@ -474,15 +540,19 @@ def _scale_notes(scale: Scale, response: float, *, own: bool) -> list[str]:
 
 
 def _left_out(base: Scenario) -> list[str]:
-    """Return a line on what of the scenario is no part of its course."""
+    """Return a line that names the parts of the scenario that are no part of its course; none if there are none."""
+    effects = base.effects
     names = [name for name in _NO_COURSE if getattr(base, name)]
-    air = base.effects.air
-    if air is not None and (any(air.wind) or air.turbulence is not None):
+    if effects.air is not None and (any(effects.air.wind) or effects.air.turbulence is not None):
         names.append("wind")
-    names += [name for name in ("battery", "disturbance", "load") if getattr(base.effects, name, None) is not None]
-    names += [entry.name for entry in base.constraints if entry.signal not in (*_CARRIED, *_BOUNDED)]
+    for name in ("battery", "disturbance", "load"):
+        if getattr(effects, name, None) is not None:
+            names.append(name)
+    for entry in base.constraints:
+        if entry.signal not in (*_CARRIED, *_BOUNDED):
+            names.append(entry.name)
     if base.polytopes:
         names.append("controller.polytopes")
-    if names:
-        return [f"Left out, as no part of the course: {', '.join(names)}."]
-    return []
+    if not names:
+        return []
+    return [f"Left out, as no part of the course: {', '.join(names)}."]

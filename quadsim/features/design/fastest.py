@@ -1,11 +1,9 @@
 """The fastest speed at which a scenario's course is flown within every bound, by bisection of audited flights.
 
-A pace multiplies the speed of the course: at pace p every time of it, its filter's and those of moving obstacles and of
-windows included, is 1 / p of what is stated; lengths and bounds stay.  A pace holds where the flight is satisfied and
-every required margin is at least a share of half its band (`quadsim.flight.audit.worst_share`).  Limits of the commands
-have to hold alone: a command at its own bound is no near miss.
-
-What is found is a pace that was flown and holds, and one at most `_RESOLUTION` faster that was flown and does not.
+At pace p every time of the course, of its filter, of moving obstacles and of windows is 1 / p of what is stated;
+lengths and bounds stay.  A pace holds if the flight is satisfied and every required margin is at least a share of half
+its band (`quadsim.flight.audit.worst_share`); limits of the commands only have to hold: a command at its own bound is
+normal.  The result has a pace that holds and one at most `_RESOLUTION` faster that does not; both were flown.
 """
 
 from __future__ import annotations
@@ -22,7 +20,8 @@ from tomlkit.items import AoT
 
 from quadsim.console.progress import Progress, silent
 from quadsim.errors import InputError, ParameterError, printable
-from quadsim.features.design.first_scenario import SHARE, FirstScenario
+from quadsim.features.design.courses_by_rule import SHARE
+from quadsim.features.design.first_scenario import FirstScenario
 from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
@@ -37,9 +36,9 @@ LARGEST_MARGIN: Final = 0.9
 _STEP: Final = 1.3  # from one pace to the next, until one holds and one does not
 _LOWEST = 0.05
 _HIGHEST = 50.0
-"""Paces that are looked at."""
+"""Range of the paces that are tried."""
 _RESOLUTION: Final = 0.01  # between the pace that holds and the one that does not, as a share
-_USUAL_FLIGHTS: Final = 9  # that the progress is stated in, until it is known
+_USUAL_FLIGHTS: Final = 9  # total shown as progress; the true number is not known before the end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +53,13 @@ class PacedFlight:
 
     @property
     def text(self) -> str:
-        """What ends it, or comes nearest."""
+        """Its nearest bound, and its verdict if that is not `satisfied`."""
         if self.worst is None:
             return self.outcome
-        limit = self.worst.limit
-        left = f"{limit.name} has {100.0 * self.worst.share:.3g} % of half its band left"
+        nearest = f"{self.worst.limit.name} has {100.0 * self.worst.share:.3g} % of half its band left"
         if self.outcome == "satisfied":
-            return left
-        return f"{left}; {self.outcome}"
+            return nearest
+        return f"{nearest}; {self.outcome}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +97,10 @@ def paced(scenario: Scenario, pace: float) -> Scenario:
         if shapes:
             tables[name] = [plain(scaled_table(shape, scale)) for shape in shapes]
     if scenario.constraints:
-        entries = zip(tables["constraints"], scenario.constraints, strict=True)
-        tables["constraints"] = [_retimed(entry, limit, scale) for entry, limit in entries]
+        retimed = []
+        for entry, limit in zip(tables["constraints"], scenario.constraints, strict=True):
+            retimed.append(_retimed(entry, limit, scale))
+        tables["constraints"] = retimed
     if not scenario.ends_with_course:
         periods = math.ceil(scenario.duration / pace / scenario.control_period - 1e-6)
         tables["duration"] = round(periods * scenario.control_period, 9)
@@ -109,9 +109,14 @@ def paced(scenario: Scenario, pace: float) -> Scenario:
 
 def _retimed(entry: dict[str, Any], limit: Limit, scale: Scale) -> dict[str, Any]:
     """Return an entry of `[[constraints]]` with its window at another pace; its bounds stay."""
-    timed = scaled_limit(replace(limit, lower=-math.inf, upper=math.inf), scale)
-    window = {name: getattr(timed, name) for name in ("start", "stop")}
-    return {**entry, **{name: value for name, value in window.items() if name in entry}}
+    unbounded = replace(limit, lower=-math.inf, upper=math.inf)
+    timed = scaled_limit(unbounded, scale)
+    retimed = dict(entry)
+    if "start" in entry:
+        retimed["start"] = timed.start
+    if "stop" in entry:
+        retimed["stop"] = timed.stop
+    return retimed
 
 
 def fly_fastest(scenario: Scenario, margin: float = DEFAULT_MARGIN, progress: Progress = silent) -> FastestCourse:
@@ -148,22 +153,23 @@ def fly_fastest(scenario: Scenario, margin: float = DEFAULT_MARGIN, progress: Pr
     return FastestCourse(scenario=at_fastest, margin=margin, fastest=holds, stopped=fails, flights=tuple(flights))
 
 
-def at_fastest(first: FirstScenario, found: FastestCourse) -> FirstScenario:
-    """Return a first scenario at the pace that was found, with a comment at each number that it changes."""
+def at_fastest(first: FirstScenario, fastest: FastestCourse) -> FirstScenario:
+    """Return a first scenario at the fastest pace that holds, with a comment at each number that it changes."""
     document = tomlkit.parse(first.text)
-    _restate(document, paced(first.scenario, 1.0).tables, found.scenario.tables)
-    by_rule = f" at {100.0 * SHARE:g} % of "
-    what = first.scenario.description.partition(by_rule)[0]
-    about = f"{what}, as fast as its bounds permit"
-    document["description"] = about
+    _restate(document, paced(first.scenario, 1.0).tables, fastest.scenario.tables)
+    subject, _, _ = first.scenario.description.partition(f" at {100.0 * SHARE:g} % of ")
+    description = f"{subject}, as fast as its bounds permit"
+    document["description"] = description
     _, made_by, rest = document.as_string().split("\n", 2)
-    title = f"# A first flight of {printable(about)}."
-    lines = "".join(f"# {line}\n" for text in found.lines for line in textwrap.wrap(text, WIDTH - 2))
-    return replace(first, text=f"{title}\n{made_by} --fastest --margin {found.margin:g}\n{lines}{rest}")
+    head = f"# A first flight of {printable(description)}.\n{made_by} --fastest --margin {fastest.margin:g}\n"
+    for sentence in fastest.lines:
+        for line in textwrap.wrap(sentence, WIDTH - 2):
+            head += f"# {line}\n"
+    return replace(first, text=head + rest)
 
 
 def _restate(stated: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-    """Change the numbers of a document that differ in two tables, in place, to the later."""
+    """Change the numbers of a document that differ between two tables to those of the second, in place."""
     for key, value in after.items():
         earlier = before.get(key)
         if value == earlier:
@@ -181,7 +187,7 @@ def _restate(stated: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -
 
 
 def _bracket(fly: Callable[[float], PacedFlight]) -> tuple[PacedFlight, PacedFlight]:
-    """Return a pace that holds, and a faster one that does not."""
+    """Return flights at a pace that holds and at one `_STEP` faster that does not, from the stated speed on."""
     flight = fly(1.0)
     if not flight.speed > 0.0:
         raise InputError("--fastest needs a course that moves")
@@ -209,11 +215,11 @@ def _fly_at(scenario: Scenario, pace: float, margin: float) -> PacedFlight:
     steps = np.linalg.norm(np.diff(reference[:, :3], axis=0), axis=1)
     flight: Flight = Rollout(assembly).fly()
     worst = worst_finding(flight.findings)
-    holds = flight.outcome == "satisfied" and (worst is None or margin == 0.0 or worst.share >= margin)
+    has_margin = worst is None or margin == 0.0 or worst.share >= margin
     return PacedFlight(
         pace=pace,
         speed=float(steps.max()) / assembly.scenario.control_period,
         outcome=flight.outcome,
         worst=worst,
-        holds=holds,
+        holds=flight.outcome == "satisfied" and has_margin,
     )

@@ -15,8 +15,9 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, UnknownNameError
 from quadsim.features.design.any_course import course_for, course_names
+from quadsim.features.design.courses_by_rule import ALLOWED_SHARE, SHARE, eight_length
 from quadsim.features.design.fastest import at_fastest, fly_fastest, paced
-from quadsim.features.design.first_scenario import ALLOWED_SHARE, SHARE, FirstScenario, eight_length, first_scenario
+from quadsim.features.design.first_scenario import FirstScenario, first_scenario
 from quadsim.features.design.rules import design_for
 from quadsim.flight.audit import COMMAND_SIGNALS
 from quadsim.scenarios.assembly import Assembly

@@ -17,14 +17,9 @@ from first_flights import FirstFlight, fly_first, vehicles
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
-from quadsim.features.design.first_scenario import (
-    ALLOWED_SHARE,
-    BASELINE_SHARE,
-    COURSES,
-    DESIGNED_LAWS,
-    HEIGHT_OVER_ERROR,
-    first_scenario,
-)
+from quadsim.features.design.controller_text import BASELINE_SHARE
+from quadsim.features.design.courses_by_rule import ALLOWED_SHARE, COURSES, HEIGHT_OVER_ERROR
+from quadsim.features.design.first_scenario import DESIGNED_LAWS, first_scenario
 from quadsim.mpc.laws.lqr import bryson_objective
 from quadsim.mpc.laws.robust import Robust
 from quadsim.scenarios.assembly import Assembly

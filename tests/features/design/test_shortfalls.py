@@ -13,7 +13,8 @@ from quadsim.assets import vehicle_path
 from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_DONE
 from quadsim.errors import ParameterError
-from quadsim.features.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
+from quadsim.features.design.courses_by_rule import COURSES
+from quadsim.features.design.first_scenario import DESIGNED_LAWS, first_scenario
 from quadsim.features.design.shortfalls import shortfalls
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.schema.base import fields_of

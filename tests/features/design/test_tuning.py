@@ -12,7 +12,8 @@ from first_flights import vehicles
 from quadsim.controller import StepInputs
 from quadsim.errors import ParameterError
 from quadsim.features.design.authority import control_authority
-from quadsim.features.design.first_scenario import SHARE, first_scenario, largest_eight
+from quadsim.features.design.courses_by_rule import SHARE, largest_eight
+from quadsim.features.design.first_scenario import first_scenario
 from quadsim.features.design.rules import FASTEST_LOOP, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
 from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.problem.model import continuous_model, discretise
