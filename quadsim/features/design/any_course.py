@@ -462,7 +462,7 @@ def _ground(base: Scenario, assembly: Assembly) -> str:
     assert ground is not None
     has_effect = ground.effect and assembly.vehicle.rotor_radius is not None
     lines = stated_lines("[effects.ground]", replace(ground, effect=has_effect), set())
-    return "\n" + "\n".join(lines) + "\n"
+    return "\n" + "\n".join(lines)
 
 
 def _clearance(base: Scenario, scale: Scale) -> float | None:

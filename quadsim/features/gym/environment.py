@@ -1,4 +1,9 @@
-"""Scenarios as Gymnasium environments: the plant, sensors, air and audit of `quadsim run`, an agent in the loop."""
+"""A scenario as a Gymnasium environment: the plant, sensors, air and audit of `quadsim run`, an agent in the loop.
+
+A step is one control period: an action becomes a command (`spaces.py`), the loop of `quadsim.rollout` flies it, and the
+observation, the reward (`rewards.py`) and the margins follow.  `episodes.py` draws what an episode flies; many
+environments at once are `vector.py`.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +114,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if render_mode not in (None, "rgb_array"):
             raise ParameterError("", "render_mode", render_mode, "rgb_array or None")
         horizon = self._base.controller.horizon
-        preview = horizon if preview is None else preview
+        if preview is None:
+            preview = horizon
         if not 1 <= preview <= horizon:
             raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
@@ -205,13 +211,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         assembly = self.episodes.assembly(scenario)
         if self.episodes.varied:
             self.actions = Actions(self._action, scenario, assembly.vehicle)
-        # events that change the controller need a real one
-        law: Any
-        if scenario.controller_changes:
-            law = None
-        else:
-            law = Agent(scenario.controller.horizon)
-        self._flight = Rollout(assembly, law)
+        controller: Any = Agent(scenario.controller.horizon)
+        if scenario.controller_changes:  # events that change the controller need the scenario's own
+            controller = None
+        self._flight = Rollout(assembly, controller)
         self.limits = self._flight.limits
         self._margins = Margins(self.limits, scenario.plant.timestep)
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
@@ -219,7 +222,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._truth = self._seen.truth
         self._over = False
         loop = self._flight.loop
-        return self._vector(self._seen), self._info(*self._margins.of_start(loop.physics, loop.rotors))
+        worst, sampled = self._margins.of_start(loop.physics, loop.rotors)
+        return self._vector(self._seen), self._info(worst, sampled)
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
@@ -236,15 +240,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._over:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
         seen = self._seen
-        if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
-            command = self._answered[2]
-        else:
-            command = self.actions.command(action, flight.loop.controller.horizon, float(seen.state[INDEX["yaw"]]))
-        nothing = np.full(len(self.limits), np.inf)
+        command = self._command(action)
         try:
             sample = flight.loop.step(command)
         except FlightError:
             self._over = True
+            nothing = np.full(len(self.limits), np.inf)
             return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
         try:
             self._seen = flight.loop.observation
@@ -255,10 +256,22 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             moment = replace(seen.moment, acting=sample.speeds)
             self._seen = replace(seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
-        info = self._info(*self._margins.of_period(sample))
+        worst, sampled = self._margins.of_period(sample)
+        info = self._info(worst, sampled)
         reward = self._reward.of_one(*self.outcome, info["margins"])
         self._over = flight.done
-        return self._vector(self._seen), reward, terminated, self._over and not terminated, info
+        truncated = self._over and not terminated
+        return self._vector(self._seen), reward, terminated, truncated, info
+
+    def _command(self, action: Action) -> Command:
+        """Return the command of an action: the controller's where it answered with this very action in this period."""
+        flight = self.started
+        if self._answered is not None:
+            period, answer, command = self._answered
+            if period == flight.k and np.array_equal(answer, action):
+                return command
+        yaw = float(self._seen.state[INDEX["yaw"]])
+        return self.actions.command(action, flight.loop.controller.horizon, yaw)
 
     def controller_action(self) -> Action:
         """Return the command of the scenario's controller at this time, computed once per period.
@@ -273,16 +286,18 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """
         self.require_open()
         flight = self.started
-        if self._answered is None or self._answered[0] != flight.k:
-            seen = self._seen
-            self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
-            if isinstance(agent := flight.loop.controller, Agent):
-                flight.loop.controller = Assembly(self.scenario).controller()
-                flight.loop.controller.reset(agent.speeds)
-            command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
-            self.action_for(command)
-        assert self._answered is not None
-        return self._answered[1]
+        if self._answered is not None:
+            period, answer, _ = self._answered
+            if period == flight.k:
+                return answer
+        self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
+        agent = flight.loop.controller
+        if isinstance(agent, Agent):
+            flight.loop.controller = Assembly(self.scenario).controller()
+            flight.loop.controller.reset(agent.speeds)
+        seen = self._seen
+        command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
+        return self.action_for(command)
 
     def action_for(self, command: Command) -> Action:
         """Return the action equivalent to a command; taken next, it flies that command with its plan and status.
@@ -302,8 +317,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def flight(self) -> Flight:
         """Return the episode so far as an audited flight, which can be saved and plotted."""
-        law = self.started.loop.controller
-        return replace(self.started.flight(), controller=law.name, solver=law.solver)
+        controller = self.started.loop.controller
+        return replace(self.started.flight(), controller=controller.name, solver=controller.solver)
 
     def render(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
         """Return the picture (height, width, 3), rendered by a separate process; None without a render mode.
@@ -336,20 +351,23 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         acting = seen.moment.acting
         assert acting is not None
         if len(rows) < self.preview:
-            last = rows[-1:] if len(rows) else seen.reference[None]
+            last = rows[-1:]
+            if not len(rows):
+                last = seen.reference[None]
             rows = np.concatenate([rows, np.repeat(last, self.preview - len(rows), axis=0)])
         return self.observations.of(seen.state, rows[: self.preview], acting)
 
     def _info(self, worst: Array, sampled: Array) -> dict[str, Any]:
-        self.violated = beyond = violated(self._margins.tolerances, self._margins.required, worst, sampled)
+        """Return `info` of the margins (m,) within the step and at its end."""
+        self.violated = violated(self._margins.tolerances, self._margins.required, worst, sampled)
         loop = self.started.loop
         names = self.constraint_names
         return {
             "margins": dict(zip(names, worst.tolist(), strict=True)),
             "margins_sampled": dict(zip(names, sampled.tolist(), strict=True)),
             "constraint_values": -worst,
-            "constraint_violation": int(beyond.any()),
-            "cost": float(beyond.sum()),
+            "constraint_violation": int(self.violated.any()),
+            "cost": float(self.violated.sum()),
             "time": loop.time,
             "phase": str(self._seen.moment.phase),
             "reason": loop.reason or "",

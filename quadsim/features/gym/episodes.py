@@ -1,4 +1,8 @@
-"""The scenarios of an environment's episodes: seeds, or the draws of a campaign."""
+"""The scenarios of an environment's episodes: one scenario with drawn seeds, or the drawn flights of a campaign.
+
+`Episodes.draw` is called at each reset, by `environment.py` and `vector.py`; where something varies, `[set]` changes
+the scenario, and a flight of the campaign gives the values of `[[vary]]`.
+"""
 
 from __future__ import annotations
 
@@ -113,8 +117,10 @@ class Episodes:
 
     def assembly(self, scenario: Scenario) -> Assembly:
         """Return the parts of an episode, with the bounds of a user's controller where a campaign varies it."""
-        as_in_base = (scenario.vehicle, scenario.recorded) == (self.base.vehicle, self.base.recorded)
-        assembly = Assembly(scenario, self._vehicle if as_in_base else None)  # its file is read once
+        vehicle = None
+        if scenario.vehicle == self.base.vehicle and scenario.recorded == self.base.recorded:
+            vehicle = self._vehicle  # its file is read once
+        assembly = Assembly(scenario, vehicle)
         if self.varied:
             return assembly.audited()
         return assembly

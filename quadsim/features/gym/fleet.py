@@ -1,4 +1,8 @@
-"""What flies many environments: the core, all at once; or, where it cannot, single environments one after another."""
+"""Fleets fly many environments: `Together` by the core, all at once; `Apart` one after another, where it cannot.
+
+Each step, `Together` turns actions into commands, lets the core fly a control period, and computes observations,
+margins, rewards and ends for all N at once, with the bits of single environments.  `vector.py` draws and resets.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +36,12 @@ Flags = NDArray[np.bool_]
 
 _YAW: Final = INDEX["yaw"]
 _HEIGHT: Final = INDEX["z"]
-_NEAR_LOSS: Final = 1.0 - 1e-6  # share of a limit of [lost] beyond which a vehicle is looked at by itself
+_NEAR_LOSS: Final = 1.0 - 1e-6  # share of a limit of [lost] beyond which a vehicle is checked by itself
 MOST_SETUPS: Final = 1024  # drawn flights whose parts are kept
 
 
 def obstacle_to_batch(scenario: Scenario) -> str | None:
-    """Return what of a scenario the core cannot fly by itself between two actions, or None."""
+    """Return the first thing in a scenario that the core cannot fly by itself between two actions; None without."""
     ground = scenario.effects.ground
     reasons = {
         "an estimator": scenario.estimator is not None,
@@ -49,12 +53,15 @@ def obstacle_to_batch(scenario: Scenario) -> str | None:
     for event in scenario.events:
         if isinstance(event, Stall | SetpointEvent | ControllerEvent):
             reasons[f"the event {event.type!r}"] = True
-    return next((reason for reason, present in reasons.items() if present), None)
+    for reason, present in reasons.items():
+        if present:
+            return reason
+    return None
 
 
 @dataclass
 class StepResults:
-    """What a step or a reset gives, an entry or a row for each of N environments."""
+    """The results of a step or a reset, an entry or a row for each of N environments."""
 
     observations: Array  # (N, n_o)
     rewards: Array  # (N,)
@@ -69,7 +76,7 @@ class StepResults:
 
     @classmethod
     def empty(cls, count: int, entries: int, limits: int) -> StepResults:
-        """Return one of N environments, of observations with so many entries, and of m limits."""
+        """Return results to fill in: of N environments, of observations with so many entries, and of m limits."""
         return cls(
             observations=np.zeros((count, entries)),
             rewards=np.zeros(count),
@@ -122,9 +129,11 @@ class Apart:
     def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """See `Fleet`."""
         for place, episode in episodes.items():
-            frame.observations[place], info = self._environments[place].start(episode)
+            observed, info = self._environments[place].start(episode)
+            frame.observations[place] = observed
             frame.rewards[place] = 0.0
-            frame.terminated[place] = frame.truncated[place] = False
+            frame.terminated[place] = False
+            frame.truncated[place] = False
             self._fill(place, info, frame)
 
     def step(self, actions: Array, flying: Flags, frame: StepResults) -> None:
@@ -135,10 +144,10 @@ class Apart:
             before = environment.started.k
             observed, _, terminated, truncated, info = environment.step(actions[place])
             diverged[place] = environment.started.k == before
-            cut = self._most is not None and before + 1 >= self._most
+            at_limit = self._most is not None and before + 1 >= self._most
             frame.observations[place] = observed
             frame.terminated[place] = terminated
-            frame.truncated[place] = truncated or (cut and not terminated)
+            frame.truncated[place] = truncated or (at_limit and not terminated)
             self._fill(place, info, frame)
         margins = dict(zip(self._names, frame.smallest.T, strict=False))
         rewards = self._rewards.of_many(self._state.copy(), self._reference.copy(), self._speeds.copy(), margins)
@@ -150,10 +159,14 @@ class Apart:
             environment.close()
 
     def _fill(self, place: int, info: dict[str, Any], frame: StepResults) -> None:
+        """Fill in the row of an environment, but for observation, reward and end, which its step returned."""
         frame.time[place] = info["time"]
         frame.phases[place] = info["phase"]
         frame.reasons[place] = info["reason"]
-        self._state[place], self._reference[place], self._speeds[place] = self._environments[place].outcome
+        state, reference, speeds = self._environments[place].outcome
+        self._state[place] = state
+        self._reference[place] = reference
+        self._speeds[place] = speeds
         if frame.smallest.shape[1]:
             frame.smallest[place] = -info["constraint_values"]
             frame.at_end[place] = list(info["margins_sampled"].values())
@@ -161,7 +174,7 @@ class Apart:
 
 
 class Setup:
-    """What episodes of one scenario have in common, whatever their seed.
+    """The parts that episodes of one scenario have in common, whatever their seed.
 
     Attributes:
         assembly: the parts of the scenario.
@@ -174,7 +187,7 @@ class Setup:
         loss: (4,) limits of `quadsim.flight.phase.CRITERIA`, infinite where there is none.
         sensed: whether sensors give the state.
         drawn: whether an episode's seed matters.
-        spares: what has flown such episodes, and flies nothing now.
+        spares: plants and autopilots that have flown such episodes, and are free.
     """
 
     def __init__(self, assembly: Assembly, action: str, preview: int) -> None:
@@ -197,7 +210,7 @@ class Setup:
 
 @dataclass
 class _Slot:
-    """What flies at a place."""
+    """The plant, autopilot and navigation of an environment."""
 
     setup: Setup
     plant: Plant
@@ -225,16 +238,21 @@ class Together:
         self._setups: OrderedDict[int | None, Setup] = OrderedDict()
         self._slots: list[_Slot | None] = [None] * count
         self._sensed: list[int] = []
-        limits = len(self._names) if margins else 0
+        limits = 0
+        if margins:
+            limits = len(self._names)
         self._batch = PlantBatch(count, steps=base.steps_per_period, limits=limits, threads=threads)
         first = self._setup(Episode(scenario=base, flight=None, draw={}), key=None)
-        self._rows = np.repeat(first.rows[None], count if self._episodes.varied else 1, axis=0)
-        if self._episodes.varied:
+        if self._episodes.varied:  # a reference for each environment
+            self._rows = np.repeat(first.rows[None], count, axis=0)
             self._table = np.arange(count)
         else:
+            self._rows = np.repeat(first.rows[None], 1, axis=0)
             self._table = np.zeros(count, int)
         self._ahead = np.arange(1 + self._preview)
-        self._scale = {name: np.repeat(values[None], count, axis=0) for name, values in first.actions.scale.items()}
+        self._scale = {}
+        for name, values in first.actions.scale.items():
+            self._scale[name] = np.repeat(values[None], count, axis=0)
         self._k = np.zeros(count, int)
         self._periods = np.full(count, first.periods)
         self._turns = np.full(count, np.nan)
@@ -257,21 +275,25 @@ class Together:
             self._put(place, episode)
         places = np.array([*episodes])
         self._follow(places)
-        for error in self._lost(places).values():
-            raise error
+        lost = self._lost(places)
+        if lost:
+            raise next(iter(lost.values()))
         frame.observations[places] = self._observe(places)
         frame.rewards[places] = 0.0
         frame.time[places] = 0.0
-        frame.terminated[places] = frame.truncated[places] = False
+        frame.terminated[places] = False
+        frame.truncated[places] = False
         frame.phases[places] = str(Phase.FLYING)
         frame.reasons[places] = ""
         self._fill_margins(places, frame)
 
     def _put(self, place: int, episode: Episode) -> None:
-        """Put what flies an episode at its start."""
+        """Put the vehicle of an episode at its start."""
         setup = self._setup(episode, key=episode.flight)
         slot = self._slot(place, setup, episode)
-        margins = setup.margins if self._margined else None
+        margins = None
+        if self._margined:
+            margins = setup.margins
         self._batch.put(place, slot.plant, setup.state, setup.speeds, loop=slot.autopilot, margins=margins)
         if margins is not None:
             self._tolerances[:, place] = margins.tolerances
@@ -294,28 +316,30 @@ class Together:
             self._state[place] = slot.navigation.state()
 
     def _setup(self, episode: Episode, key: int | None) -> Setup:
-        """Return what an episode's scenario has in common with others of its kind, kept from before where it is."""
+        """Return the setup of an episode's scenario, which is kept for others of the same flight of the campaign."""
         setup = self._setups.get(key)
-        if setup is None:
-            if (obstacle := obstacle_to_batch(episode.scenario)) is not None:
-                raise InputError(f"flight {key} of the campaign has {obstacle}, which its scenario does not have")
-            setup = Setup(self._episodes.assembly(episode.scenario), self._action, self._preview)
-            scenario = episode.scenario
-            if (scenario.control_period, scenario.steps_per_period) != (self._period, self._batch.steps):
-                raise InputError(f"flight {key} of the campaign has another control period or physics step than others")
-            names = tuple(limit.name for limit in setup.margins.limits)
-            if names != self._names:
-                raise InputError(f"flight {key} of the campaign has the constraints {names}, others {self._names}")
-            self._setups[key] = setup
-            if len(self._setups) > MOST_SETUPS:
-                self._setups.popitem(last=False)
+        if setup is not None:
+            return setup
+        scenario = episode.scenario
+        obstacle = obstacle_to_batch(scenario)
+        if obstacle is not None:
+            raise InputError(f"flight {key} of the campaign has {obstacle}, which its scenario does not have")
+        setup = Setup(self._episodes.assembly(scenario), self._action, self._preview)
+        if scenario.control_period != self._period or scenario.steps_per_period != self._batch.steps:
+            raise InputError(f"flight {key} of the campaign has another control period or physics step than others")
+        names = tuple(limit.name for limit in setup.margins.limits)
+        if names != self._names:
+            raise InputError(f"flight {key} of the campaign has the constraints {names}, others {self._names}")
+        self._setups[key] = setup
+        if len(self._setups) > MOST_SETUPS:
+            self._setups.popitem(last=False)
         return setup
 
     def _slot(self, place: int, setup: Setup, episode: Episode) -> _Slot:
-        """Return what flies an episode at a place: what flew there, where that is built the same, with other draws."""
+        """Return the parts that fly an episode: those of the last one with new draws, if they are built the same."""
         slot = self._slots[place]
         assembly = setup.assembly.of(episode.scenario)
-        forces = bool(episode.scenario.forces)  # which are made with draws of their own
+        forces = bool(episode.scenario.forces)  # which are built with draws of their own
         if slot is None or slot.setup is not setup or forces:
             if slot is not None and not forces:
                 slot.setup.spares.append(slot)
@@ -334,10 +358,11 @@ class Together:
         return slot
 
     def _keep_rows(self, place: int, rows: Array) -> None:
-        """Keep a reference, and its last row as long as others last."""
-        if len(rows) > self._rows.shape[1]:
-            longer = len(rows) - self._rows.shape[1]
-            self._rows = np.concatenate([self._rows, np.repeat(self._rows[:, -1:], longer, axis=1)], axis=1)
+        """Keep a reference, with its last row repeated up to the length of the longest."""
+        longer = len(rows) - self._rows.shape[1]
+        if longer > 0:
+            last_rows = np.repeat(self._rows[:, -1:], longer, axis=1)
+            self._rows = np.concatenate([self._rows, last_rows], axis=1)
         self._rows[place, : len(rows)] = rows
         self._rows[place, len(rows) :] = rows[-1]
 
@@ -352,7 +377,10 @@ class Together:
         sensed = [i for i in self._sensed if flying[i]]
         for place in sensed:
             batch.sense(place, self._navigation(place).begin(batch.steps))
-        ended = batch.fly(commands, None if flying.all() else flying)
+        if flying.all():
+            ended = batch.fly(commands, None)
+        else:
+            ended = batch.fly(commands, flying)
         going = flying.copy()
         for place, error in ended.items():
             going[place] = False
@@ -366,8 +394,7 @@ class Together:
                 navigation.record(batch.flown(place))
                 self._state[place] = navigation.state()
         self._follow(places)
-        lost = self._lost(places)
-        for place, error in lost.items():
+        for place, error in self._lost(places).items():
             self._state[place] = batch.state[place]
             self._follow(np.array([place]))
             frame.terminated[place] = True
@@ -387,6 +414,7 @@ class Together:
         frame.reasons[place] = str(error)
 
     def _fill_margins(self, places: NDArray[np.intp], frame: StepResults) -> None:
+        """Fill in the margins of places, and which required constraints are violated."""
         if not self._margined:
             return
         smallest = self._batch.smallest[places]
@@ -404,14 +432,17 @@ class Together:
         return slot.navigation
 
     def _follow(self, places: NDArray[np.intp]) -> None:
-        """Look the reference up at the places' instants, on the turns of their yaws."""
+        """Take the reference at the times of places, its yaw on the turn of theirs."""
         rows = self._rows[self._table[places, None], self._k[places, None] + self._ahead]
         turns = self._turns[places]
         self._followed[places] = follow_turns(rows, self._state[places, _YAW], turns)
         self._turns[places] = turns
 
     def _lost(self, places: NDArray[np.intp]) -> dict[int, FlightError]:
-        """Return what of the places is lost, with the reason; a period's lowest reference counts from it on."""
+        """Return the places that are lost, with the reason.
+
+        The loss of height is below the lowest reference of the episode so far.
+        """
         states = self._batch.state[places]
         references = self._followed[places, 0]
         lowest = np.minimum(self._lowest[places], references[:, 2])

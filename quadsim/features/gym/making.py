@@ -1,4 +1,8 @@
-"""Environments by name: their ids, and what makes them."""
+"""Environments by name: the id of each scenario of the library, and `make_env` and `make_vec` for any other.
+
+An id is `quadsim/` and the name in capitals, `hummingbird-figure-eight` -> `quadsim/HummingbirdFigureEight-v0`;
+`import quadsim.gym` registers them, so that `gymnasium.make` builds the environments of `environment.py`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from quadsim.scenarios.schema.scenario import Scenario
 
 
 def environment_id(name: str) -> str:
-    """The id of a scenario of that name.
+    """Return the id of a scenario of that name.
 
     Examples:
         >>> import quadsim.gym
@@ -26,7 +30,8 @@ def environment_id(name: str) -> str:
         'quadsim/HummingbirdFigureEight-v0'
     """
     words = name.replace("_", "-").replace(".", "-").split("-")
-    return f"quadsim/{''.join(word[:1].upper() + word[1:] for word in words)}-v0"
+    capitalised = [word[:1].upper() + word[1:] for word in words]
+    return f"quadsim/{''.join(capitalised)}-v0"
 
 
 def register_library() -> None:
@@ -37,21 +42,21 @@ def register_library() -> None:
 
 
 def _specification(flown_scenario: Scenario, vary: Variation | None = None, **kwargs: Any) -> EnvSpec:
-    """Describe the environment; its time limit is the duration, which a campaign gives to each episode anew."""
-    entry_point = f"{QuadrotorEnv.__module__}:{QuadrotorEnv.__name__}"
-    most = flown_scenario.periods if vary is None else None
-    vector_entry_point = f"{QuadrotorVectorEnv.__module__}:{QuadrotorVectorEnv.__name__}"
+    """Return the specification; its time limit is the duration, unless a campaign gives each episode its own."""
+    time_limit = None
+    if vary is None:
+        time_limit = flown_scenario.periods
     return EnvSpec(
         environment_id(flown_scenario.name),
-        entry_point,
-        max_episode_steps=most,
+        f"{QuadrotorEnv.__module__}:{QuadrotorEnv.__name__}",
+        max_episode_steps=time_limit,
         kwargs=kwargs,
-        vector_entry_point=vector_entry_point,
+        vector_entry_point=f"{QuadrotorVectorEnv.__module__}:{QuadrotorVectorEnv.__name__}",
     )
 
 
 def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:
-    """The environment of any scenario, with the wrappers of `gymnasium.make`: its time limit is the duration.
+    """Return the environment of any scenario, with the wrappers of `gymnasium.make`: its time limit is the duration.
 
     With `vary` each episode ends at its own duration; `gymnasium.make` of a registered id keeps the limit of the
     scenario that ships, and takes another as `max_episode_steps`.

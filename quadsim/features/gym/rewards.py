@@ -1,4 +1,7 @@
-"""Rewards of one environment, or of many at once."""
+"""Rewards of a step: the default, exp(-distance - |yaw error|), or any function of state, reference and speeds.
+
+`RewardHook` checks the function once; `environment.py` calls it for one environment, `fleet.py` for N at once.
+"""
 
 from __future__ import annotations
 
@@ -51,8 +54,11 @@ class RewardHook:
             self._takes_margins = False
             return
         self._takes_margins = "margins" in signature.parameters
+        keywords: dict[str, None] = {}
+        if self._takes_margins:
+            keywords["margins"] = None
         try:
-            signature.bind(None, None, None, **({"margins": None} if self._takes_margins else {}))
+            signature.bind(None, None, None, **keywords)
         except TypeError:
             raise ParameterError("", "reward", f"{getattr(reward, '__name__', '')}{signature}", rule) from None
 

@@ -1,4 +1,8 @@
-"""MPC as a safety filter: it passes actions after which the robust MPC's constraints remain feasible."""
+"""MPC as a safety filter: it passes actions after which the robust MPC's constraints remain feasible.
+
+The command is the nearest to the requested rotor speeds, min |u - u_requested|^2, from which a plan within the robust
+MPC's constraints exists (`quadsim.mpc.laws.parts.safety_filter`).  It wraps an environment of `environment.py`.
+"""
 
 from __future__ import annotations
 
@@ -80,9 +84,12 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         self._vehicle: Vehicle | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the law, which is native memory; the environment leaves out its episode."""
-        kept = {name: value for name, value in self.__dict__.items() if name not in ("_filter", "_law")}
-        return {**kept, "_vehicle": None}
+        """Leave out the controller, which is native memory; the environment leaves out its episode."""
+        kept = dict(self.__dict__)
+        kept.pop("_filter", None)
+        kept.pop("_pilot", None)
+        kept["_vehicle"] = None
+        return kept
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See `gymnasium.Env.reset`."""
@@ -92,12 +99,13 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
             vehicle = started.vehicle
             period = started.scenario.control_period
             self._filter = safety_filter(self._spec, vehicle, period)
-            self._law = Pilot(self._filter, vehicle, guard=self._spec.guard(vehicle, period))
-            self._vehicle = started.vehicle
+            self._pilot = Pilot(self._filter, vehicle, guard=self._spec.guard(vehicle, period))
+            self._vehicle = vehicle
         acting = started.observation.moment.acting
         assert acting is not None
-        self._law.reset(acting)
-        self.steps = self.interventions = 0
+        self._pilot.reset(acting)
+        self.steps = 0
+        self.interventions = 0
         return observed
 
     def step(self, action: Action) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -112,18 +120,19 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
             raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
         self._base.require_open()
         seen = self._base.started.observation
-        horizon = self._law.horizon
         requested = self._base.actions.held_speeds(action, _body_rates(seen))
         self._filter.requested = requested
+        horizon = self._pilot.horizon
         preview = seen.preview[:horizon]
         preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
-        command = self._law.step(seen.moment, seen.state, preview)
+        command = self._pilot.step(seen.moment, seen.state, preview)
         correction = float(np.abs(command.speeds - requested).max())
         intervened = command.status != UNCONSTRAINED
         self.steps += 1
         self.interventions += intervened
         space = self._base.action_space
-        within = np.clip(np.nan_to_num(np.asarray(action, space.dtype)), space.low, space.high)
+        finite = np.nan_to_num(np.asarray(action, space.dtype))
+        within = np.clip(finite, space.low, space.high)
         self._base.fly_instead(within, command)
         observed, reward, terminated, truncated, info = self.env.step(within)
         report = {"intervened": intervened, "correction": correction, "fallback": command.fallback}

@@ -1,4 +1,9 @@
-"""Observations and actions of an agent: rotor speeds, deviations from hover, or thrust and body rates."""
+"""Observations and actions of an agent: rotor speeds, deviations from hover, or thrust and body rates.
+
+`Actions` turns an action a in [-1, 1] into a command, hover + a (high - hover) for a >= 0 and hover + a (hover - low)
+below, and back; `Observations` concatenates state, preview and command.  `environment.py` uses them for one
+environment, `fleet.py` for N at once.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +83,9 @@ class Actions:
         high = bounds.u_max
         hover = vehicle.hover_speeds
         self.kind = kind
-        self.numbers = 8 if kind == "attitude" else N_ROTORS
+        self.numbers = N_ROTORS
+        if kind == "attitude":
+            self.numbers = 8
         self.scale: dict[str, Array] = {}
         self._vehicle = vehicle
         self._settings: AutopilotSettings | None = None
@@ -90,13 +97,11 @@ class Actions:
             raise ParameterError(owner, "speed", hover_bounds, f"below and above the hover speed, {span(hover)} rad/s")
         self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
         if kind in TARGETS:
-            timestep = scenario.plant.timestep
-            rate = 1.0 / (max(1, round(INNER_PERIOD / timestep)) * timestep)
-            none = (0.0, 0.0, 0.0)
-            self._settings = AutopilotSettings(rate=rate, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
+            self._settings = _rate_loop(scenario.plant.timestep)
             self._speeds = float(low[0]), float(high[0])
             hover = np.array(vehicle.mass * vehicle.gravity)
-            low, high = (np.array(vehicle.level_thrust(float(speed))) for speed in (low.max(), high.min()))
+            low = np.array(vehicle.level_thrust(float(low.max())))
+            high = np.array(vehicle.level_thrust(float(high.min())))
             self.scale["half_period"] = np.array(0.5 * scenario.control_period)
         elif kind == "thrust":
             low = vehicle.thrusts(low)
@@ -117,7 +122,7 @@ class Actions:
         return self.autopilot()
 
     def command(self, action: Action, horizon: int, yaw: float = 0.0, *, bounded: bool = True) -> Command:
-        """The command, a plan of this many rows, for an action at a measured yaw [rad].
+        """Return the command, a plan of this many rows, for an action at a measured yaw [rad].
 
         Raises:
             ParameterError: it has another shape than `space`, is not of numbers, or, where it is to be `bounded`, is
@@ -136,7 +141,8 @@ class Actions:
             return None
         period = 2.0 * float(self.scale["half_period"])
         gains = tuple((1.0 - math.exp(-bandwidth * period)) / period for bandwidth in BANDWIDTH)
-        return Autopilot(self._vehicle, replace(self._settings, p=gains), speeds=self._speeds)
+        settings = replace(self._settings, p=gains)
+        return Autopilot(self._vehicle, settings, speeds=self._speeds)
 
     def require_held(self) -> None:
         """Refuse actions that are not rotor speeds to hold, and do not become any by `held_speeds`.
@@ -175,7 +181,7 @@ class Actions:
         return self._holding.speeds(0.0, target, body_rates, rotors, level)
 
     def of(self, speeds: Array) -> Action:
-        """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.
+        """Return the action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these exceed their bounds.
 
         Raises:
             ParameterError: actions are not rotor speeds.
@@ -190,7 +196,19 @@ class Actions:
         else:
             amount = speeds
         deviation = amount - self.scale["hover"]
-        return (deviation / np.where(deviation < 0.0, self.scale["down"], self.scale["up"])).astype(np.float32)
+        largest = np.where(deviation < 0.0, self.scale["down"], self.scale["up"])
+        return (deviation / largest).astype(np.float32)
+
+
+def _rate_loop(timestep: float) -> AutopilotSettings:
+    """Return the settings of the autopilot of actions: a proportional rate loop, without filter and delay.
+
+    Args:
+        timestep: of the physics [s], of which the autopilot's period is a multiple.
+    """
+    period = max(1, round(INNER_PERIOD / timestep)) * timestep
+    none = (0.0, 0.0, 0.0)
+    return AutopilotSettings(rate=1.0 / period, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
 
 
 def check_action(action: Action, space: Box, *, bounded: bool = True) -> Array:
@@ -239,17 +257,20 @@ def action_commands(kind: str, scale: Mapping[str, Array], actions: Array, yaw: 
 
 
 def _targets_of(kind: str, scale: Mapping[str, Array], actions: Array, yaw: Array) -> Array:
-    """Collective thrust and body rates; with `attitude` the attitude too, at the yaw of the middle of the period."""
+    """Return thrust and body rates (N, 4); with `attitude` (N, 8), the attitude too, at the yaw of the mid-period."""
     share = actions[:, 0]
-    targets = np.empty((len(actions), 4 if kind == "rates" else 8))
-    targets[:, 0] = scale["hover"] + np.abs(share) * (np.where(share < 0.0, -scale["down"], scale["up"]))
+    thrust = scale["hover"] + np.abs(share) * (np.where(share < 0.0, -scale["down"], scale["up"]))
     if kind == "rates":
+        targets = np.empty((len(actions), 4))
+        targets[:, 0] = thrust
         targets[:, 1:] = actions[:, 1:] * LARGEST_RATES
         return targets
     turning = actions[:, 3] * LARGEST_RATES[2]
     euler = np.empty((len(actions), 3))
     euler[:, :2] = actions[:, 1:3] * FULL_TILT
     euler[:, 2] = yaw + scale["half_period"] * turning
+    targets = np.empty((len(actions), 8))
+    targets[:, 0] = thrust
     targets[:, 1:3] = 0.0
     targets[:, 3] = turning
     targets[:, 4:] = euler_to_quaternion(euler)
@@ -257,12 +278,12 @@ def _targets_of(kind: str, scale: Mapping[str, Array], actions: Array, yaw: Arra
 
 
 def _speeds_of(linear: Array, quadratic: Array, thrusts: Array) -> Array:
-    """Rotor speeds of thrusts linear w + quadratic w^2 [N], as `quadsim.vehicle.Vehicle.speeds`."""
+    """Return rotor speeds of thrusts linear w + quadratic w^2 [N], as `quadsim.vehicle.Vehicle.speeds`."""
     linear = linear[:, None]
     root = np.sqrt(np.maximum(np.square(linear) + 4.0 * quadratic * thrusts, 0.0))
-    return np.where(
-        linear > 0.0, 2.0 * thrusts / (linear + root + (linear <= 0.0)), (root - linear) / (2.0 * quadratic)
-    )
+    with_linear = 2.0 * thrusts / (linear + root + (linear <= 0.0))  # without cancellation
+    otherwise = (root - linear) / (2.0 * quadratic)
+    return np.where(linear > 0.0, with_linear, otherwise)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,15 +323,19 @@ class Observations:
             "command": list(stated["speeds"].units.items()),
         }
         self._parts = tuple(parts)
-        self.layout = tuple(Entry(name=name, unit=unit) for part in parts for name, unit in entries[part])
+        layout = []
+        for part in parts:
+            for name, unit in entries[part]:
+                layout.append(Entry(name=name, unit=unit))
+        self.layout = tuple(layout)
         self.space = Box(-DIVERGED, DIVERGED, (len(self.layout),), dtype=np.float64)
 
     def of(self, state: Array, preview: Array, command: Array) -> Array:
-        """The observation of a state (12,), a preview (n, 4) and a command (4,)."""
+        """Return the observation of a state (12,), a preview (n, 4) and a command (4,)."""
         return self.of_many(state[None], preview[None], command[None])[0]
 
     def of_many(self, states: Array, previews: Array, commands: Array) -> Array:
-        """(N, n_o) observations of states (N, 12), previews (N, n, 4) and commands (N, 4)."""
+        """Return (N, n_o) observations of states (N, 12), previews (N, n, 4) and commands (N, 4)."""
         count = len(states)
         ahead = previews.shape[1] * len(REFERENCE_STATES)
         observed = np.empty((count, len(self.layout)))

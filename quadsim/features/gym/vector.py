@@ -1,4 +1,8 @@
-"""Many environments of a scenario in one process: the core flies them together."""
+"""Many environments of a scenario in one process: the core flies them together.
+
+A step checks the actions, lets a fleet fly them (`fleet.py`), resets the episodes that ended, and records the actions,
+so that `flight` can fly any recent episode again, to the bit, as an audited flight.
+"""
 
 from __future__ import annotations
 
@@ -165,7 +169,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         mask = self._mask(options.pop("reset_mask", None))
         episodes: dict[int, Episode] = {}
         for place in np.flatnonzero(mask).tolist():
-            episodes[place] = self._drawn(place, seeds[place], options)
+            episodes[place] = self._draw(place, seeds[place], options)
         frame = self._next_frame()
         self._start(episodes, frame)
         self._frame = frame
@@ -196,7 +200,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self._log.append(numbers)
         self._fleet.step(numbers, ~again, frame)
         if again.any():
-            self._start({place: self._drawn(place, None, {}) for place in np.flatnonzero(again).tolist()}, frame)
+            self._start(self._next_episodes(again), frame)
         self._frame = frame
         ended = frame.terminated | frame.truncated
         self._log.end(ended)
@@ -225,8 +229,12 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             raise ParameterError("", "place", place, f"from 0 to {self.num_envs - 1}")
         recorded = self._log.recorded(int(place), ended=ended)
         if recorded is None:
-            raise ResetNeeded(f"environment {place} has no episode " + ("that ended" if ended else "yet: call reset()"))
-        return self._single.replay(*recorded)
+            missing = "yet: call reset()"
+            if ended:
+                missing = "that ended"
+            raise ResetNeeded(f"environment {place} has no episode {missing}")
+        episode, actions = recorded
+        return self._single.replay(episode, actions)
 
     def close_extras(self, **_: Any) -> None:
         """Free native memory."""
@@ -245,6 +253,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         return frame
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """Return the seed of each environment, from one number, N of them, or none."""
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
@@ -254,12 +263,13 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ParameterError("", "seed", seed, f"one number, or {self.num_envs}")
-        for one in seeds:
-            if one is not None:
-                self._episodes.check_seed(one)
+        for stated in seeds:
+            if stated is not None:
+                self._episodes.check_seed(stated)
         return seeds
 
     def _mask(self, mask: Any) -> Flags:
+        """Return which environments are reset: all, or those of a mask (N,)."""
         if mask is None:
             return np.ones(self.num_envs, bool)
         flags = np.array(mask)
@@ -267,8 +277,15 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             raise ParameterError("options", "reset_mask", mask, f"{self.num_envs} flags, one of them true at least")
         return flags
 
-    def _drawn(self, place: int, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Draw a place's next episode."""
+    def _next_episodes(self, ended: Flags) -> dict[int, Episode]:
+        """Draw the next episodes of the environments whose last has ended."""
+        episodes = {}
+        for place in np.flatnonzero(ended).tolist():
+            episodes[place] = self._draw(place, None, {})
+        return episodes
+
+    def _draw(self, place: int, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Draw an environment's next episode."""
         generator = self._generators[place]
         if seed is None and generator is None:
             seed = self.scenario.seed + place
@@ -301,8 +318,9 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         else:
             draws = {}
         for name, value in episode.draw.items():
-            numeric = isinstance(value, int | float) and not isinstance(value, bool)
-            kind = float if numeric else object
+            kind: type = object
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                kind = float
             draws.setdefault(name, np.zeros(self.num_envs, kind))[place] = value
 
     def _info(self, mask: Flags) -> dict[str, Any]:
@@ -329,16 +347,21 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
     def _reset_at_once(self, ended: Flags) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:
         """Reset the episodes that have ended in this step."""
         frame = self._frame
-        results = frame.rewards.copy(), frame.terminated.copy(), frame.truncated.copy()
-        final: dict[str, Any] = {"final_info": self._info(ended), "_final_info": ended}
-        final["final_obs"] = np.full(self.num_envs, None, object)
-        final["_final_obs"] = ended
-        places = np.flatnonzero(ended).tolist()
-        for place in places:
-            final["final_obs"][place] = frame.observations[place].copy()
-        self._start({place: self._drawn(place, None, {}) for place in places}, frame)
+        rewards = frame.rewards.copy()
+        terminated = frame.terminated.copy()
+        truncated = frame.truncated.copy()
+        final_info = self._info(ended)
+        final_observations = np.full(self.num_envs, None, object)
+        for place in np.flatnonzero(ended).tolist():
+            final_observations[place] = frame.observations[place].copy()
+        self._start(self._next_episodes(ended), frame)
         self._ended = np.zeros(self.num_envs, bool)
-        return frame.observations.copy(), *results, {**self._info(self._started.copy()), **final}
+        info = self._info(self._started.copy())
+        info["final_info"] = final_info
+        info["_final_info"] = ended
+        info["final_obs"] = final_observations
+        info["_final_obs"] = ended
+        return frame.observations.copy(), rewards, terminated, truncated, info
 
 
 class _ActionLog:
@@ -382,18 +405,21 @@ class _ActionLog:
         last = self._ended[place]
         present = self._present[place]
         if ended or (last is not None and present is not None and last[1] == present[1]):
-            found = last
+            if last is None:
+                return None
+            episode, first, end = last
+        elif present is not None:
+            episode, first = present
+            end = self._next
         else:
-            if present is None:
-                found = None
-            else:
-                found = (*present, self._next)
-        if found is None:
             return None
-        episode, first, end = found
-        return episode, [self._steps[i - self._dropped][place] for i in range(first, end)]
+        actions = []
+        for number in range(first, end):
+            actions.append(self._steps[number - self._dropped][place])
+        return episode, actions
 
 
 def _masked(values: dict[str, Any], mask: Flags) -> dict[str, Any]:
     """Return values with the mask of the environments that have them, as Gymnasium does."""
-    return {**values, **{f"_{name}": mask for name in values}}
+    masks = {f"_{name}": mask for name in values}
+    return {**values, **masks}
