@@ -46,6 +46,7 @@ VARYING: Final = (
     (r"simulated in \S+ s\b", "simulated in # s"),
     (r"((?:median|percentile|maximum|step time) \[ms\](?: \|)?)[^\n]+", r"\1 #"),
     (r"((?:simulated in|with all files) \[s\] \|)[^\n]+", r"\1 #"),
+    (r"(deadline misses \|)[^\n]+", r"\1 #"),
     (r"quadsim \S+, mujoco \S+, piqp \S+ on [^\n]+, \d+ cores", "quadsim #, mujoco #, piqp # on #, # cores"),
     (r"\(there are \d+: [^)]*\)", "(there are #: ...)"),
 )

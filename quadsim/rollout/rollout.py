@@ -178,7 +178,7 @@ class Rollout:
             assembly = assembly.of(prepared(assembly))
         threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
         controller = _checked_controller(assembly, user_controller)
-        assembly = assembly.with_law_bounds(controller)
+        assembly = assembly.with_user_bounds(controller)
         self._started = assembly.scenario
         _check_parts(assembly, controller)
         self.vehicle = assembly.vehicle

@@ -214,7 +214,7 @@ class Assembly:
         """Return the assembly with the bounds of a user's controller, which builds it, as constraints."""
         if not isinstance(self.scenario.controller, Plugin):
             return self
-        return self.with_law_bounds(self.controller())
+        return self.with_user_bounds(self.controller())
 
     # --- vehicle -----------------------------------------------------------------------------------------------------
 
@@ -578,7 +578,7 @@ class Assembly:
         """The scenario with its controller's bounds as constraints, to apply them to another controller."""
         return self.scenario.altered(constraints=signal_limits(self.scenario, self.bounds))
 
-    def with_law_bounds(self, controller: Controller) -> Assembly:
+    def with_user_bounds(self, controller: Controller) -> Assembly:
         """Return the assembly with the bounds of a user's controller as constraints of its scenario."""
         scenario = with_user_bounds(self.scenario, controller)
         if scenario is self.scenario:
