@@ -197,7 +197,7 @@ class Nonlinear(TargetTable):
         Rates | None, doc("[deg/s] largest magnitude, one or about body x, y, z; absent: no bound")
     ] = None
     soft: Annotated[Soft | None, doc("penalty of the three above; absent: hard")] = None
-    climb_acceleration: ClimbBounds | None = None
+    climb_acceleration: ClimbBounds = None
     avoidance: Annotated[
         Avoidance | None,
         doc("absent: the controller ignores obstacles, corridors and fence; the audit does not"),

@@ -102,7 +102,7 @@ class Bounded(Weighted):
         dict[str, Pair], doc("[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c")
     ] = field(default_factory=dict)
     input_bounds: InputBounds
-    climb_acceleration: ClimbBounds | None = None
+    climb_acceleration: ClimbBounds = None
     polytopes: Annotated[
         tuple[Polytope, ...],
         MaxLen(MOST_ENTRIES),

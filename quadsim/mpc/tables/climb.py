@@ -30,7 +30,7 @@ from quadsim.vehicle import Vehicle
 CLIMB: Final = "climb_acceleration"
 """The signal of the audit that the rows bound, and the field that states them."""
 ClimbBounds = Annotated[
-    Pair,
+    Pair | None,
     doc(
         "[m/s^2] lower and upper bound of the vertical acceleration that the thrust gives in level flight, 0 in hover; "
         "absent: no bound"
