@@ -90,6 +90,24 @@ def _named(pattern: str, quantities: Sequence[str], axes: Sequence[str] = ("x", 
     return {quantity: pattern.format(axis) for quantity, axis in zip(quantities, axes, strict=True)}
 
 
+def _with_yaw(
+    name: str, *, position: str, velocity: str, acceleration: str, unused: tuple[str, ...] = ()
+) -> TableFormat:
+    """Return a format with yaw as a column, by the patterns of its columns per axis."""
+    return TableFormat(
+        name=name,
+        columns={
+            "t": "t",
+            **_named(position, POSITION_QUANTITIES),
+            "yaw": "yaw",
+            **_named(velocity, VELOCITY_QUANTITIES),
+            **_named(acceleration, ACCELERATION_QUANTITIES),
+        },
+        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+        unused=unused,
+    )
+
+
 def _coefficients(axis: str) -> tuple[str, ...]:
     """Return the columns of an axis' polynomial, from the constant up."""
     return tuple(f"{axis}^{i}" for i in range(POLYNOMIAL_DEGREE + 1))
@@ -113,17 +131,7 @@ POLYNOMIALS: Final = TableFormat(
     groups=(_YAW_COEFFICIENTS,),
 )
 TABLE_FORMATS: Final = (
-    TableFormat(
-        name="quadsim",
-        columns={
-            "t": "t",
-            **_named("{}", POSITION_QUANTITIES),
-            "yaw": "yaw",
-            **_named("v{}", VELOCITY_QUANTITIES),
-            **_named("a{}", ACCELERATION_QUANTITIES),
-        },
-        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
-    ),
+    _with_yaw("quadsim", position="{}", velocity="v{}", acceleration="a{}"),
     TableFormat(
         name="pmm_uav_planner, Agilicious",
         columns={
@@ -136,16 +144,11 @@ TABLE_FORMATS: Final = (
         groups=(QUATERNION_QUANTITIES, VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
         unused=(*_components(("w", "a_lin", "a_rot", "j", "s"), "_"), "u_1", "u_2", "u_3", "u_4"),
     ),
-    TableFormat(
-        name="uav_trajectories, sampled",
-        columns={
-            "t": "t",
-            **_named("pos{}", POSITION_QUANTITIES),
-            "yaw": "yaw",
-            **_named("vel{}", VELOCITY_QUANTITIES),
-            **_named("acc{}", ACCELERATION_QUANTITIES),
-        },
-        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+    _with_yaw(
+        "uav_trajectories, sampled",
+        position="pos{}",
+        velocity="vel{}",
+        acceleration="acc{}",
         unused=_components(("jerk", "snap")),
     ),
     POLYNOMIALS,
