@@ -1,11 +1,9 @@
 """PPO learns to fly a figure eight by thrust and body rates: `python examples/ppo.py`, four minutes on one core.
 
-Proximal policy optimisation (Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv:1707.06347) with
-generalised advantages, in NumPy, on the vector environment of `quadsim/TrackEight-v0`.  The policy and the MPC of the
-scenario then fly the campaign `track-eight` on draws of a seed that training did not use, and are audited alike.
-
-`--out` gets the policy (`policy.json`), the learning curve (`curve.csv`, `curve.png`), the comparison
-(`comparison.csv`), and both campaigns (`learned/`, `mpc/`).
+Proximal policy optimisation (Schulman et al., 2017, arXiv:1707.06347) with generalised advantages, in NumPy, on the
+vector environment of `quadsim/TrackEight-v0`.  The policy and the scenario's MPC then fly the campaign `track-eight` on
+draws of a seed that training did not use, and are audited alike.  `--out` gets the policy (`policy.json`), the learning
+curve (`curve.csv`, `curve.png`), the comparison (`comparison.csv`), and both campaigns (`learned/`, `mpc/`).
 """
 
 from __future__ import annotations

@@ -328,7 +328,7 @@ def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, design
 
 
 def _least_factor(share: Callable[[float], float]) -> float:
-    """Return the least factor of times, within that range, at which a falling share is at most 1."""
+    """Return the factor of times, `_LEAST_FACTOR` to `_LARGEST_FACTOR`, from which on a falling share is at most 1."""
     low = math.log(_LEAST_FACTOR)
     high = math.log(_LARGEST_FACTOR)
     for _ in range(_HALVINGS):

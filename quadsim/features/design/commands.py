@@ -122,9 +122,8 @@ def _for_vehicle(
     from quadsim.scenarios.assembly import stated_disturbance
     from quadsim.vehicle import load_vehicle
 
-    margin = choice.pop("margin", None)
-    if margin is not None and not fastest:
-        raise ParameterError("", "--margin", margin, "given with --fastest alone")
+    if "margin" in choice and not fastest:
+        raise ParameterError("", "--margin", choice["margin"], "given with --fastest alone")
     path = vehicle_path(file)
     vehicle = load_vehicle(path)
     law = choice.get("controller", "robust")
@@ -133,9 +132,10 @@ def _for_vehicle(
     disturbance = stated_disturbance(path)
     first = first_scenario(vehicle, file, course=course, law=law, tilt=tilt, disturbance=disturbance)
     if fastest:
+        margin = choice.get("margin", DEFAULT_MARGIN)
         with reporting(progress, "the flights") as report:
-            found = fly_fastest(first.scenario, DEFAULT_MARGIN if margin is None else margin, report)
-        first = at_fastest(first, found)
+            fastest_course = fly_fastest(first.scenario, margin, report)
+        first = at_fastest(first, fastest_course)
     return loading.ScenarioFile(first.to_toml())
 
 
@@ -210,13 +210,11 @@ def vehicle_report(
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
     path = vehicle_path(str(name))
     loaded = load_vehicle(path)
-    if scenario is None:
-        against = None
-    else:
-        against = loading.load_scenario(scenario)
-    if out is None:
-        picture = None
-    else:
+    compared = None
+    if scenario is not None:
+        compared = loading.load_scenario(scenario)
+    picture = None
+    if out is not None:
         picture = vehicle_drawing.drawing_file(out, overwrite=overwrite)
     autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
     report = vehicle_report.VehicleReport(
@@ -226,9 +224,10 @@ def vehicle_report(
         autopilot=autopilot,
         inner_lag=vehicle_report.inner_lag_of(loaded, autopilot),
         figures=vehicle_report.make_sheet(loaded),
-        scenario=None if against is None else against.name,
-        shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
     )
+    if compared is not None:
+        missed = shortfalls.shortfalls(compared, loaded)
+        report = replace(report, scenario=compared.name, shortfalls=missed)
     if picture is None:
         return report
     with results.after(report, picture):

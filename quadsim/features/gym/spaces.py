@@ -66,19 +66,13 @@ class Actions:
 
     Raises:
         UnknownNameError: there is no such kind.
-        ParameterError: the bounds leave no room around hover.
+        ParameterError: hover is not within the bounds.
     """
 
     def __init__(self, kind: str, scenario: Scenario, vehicle: Vehicle) -> None:
         if kind not in ACTIONS:
             raise UnknownNameError("action", str(kind), ACTIONS)
-        spec = scenario.controller
-        if isinstance(spec, Bounded) and spec.input_bounds is not None:
-            bounds = spec.input_bounds.actuators(vehicle)
-            owner = "controller.input_bounds"
-        else:
-            bounds = ActuatorBounds.of_vehicle(vehicle)
-            owner = f"vehicle {vehicle.name}"
+        bounds, owner = _speed_bounds(scenario, vehicle)
         low = bounds.u_min
         high = bounds.u_max
         hover = vehicle.hover_speeds
@@ -200,6 +194,14 @@ class Actions:
         return (deviation / largest).astype(np.float32)
 
 
+def _speed_bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[ActuatorBounds, str]:
+    """Return the controller's bounds on rotor speeds, or else the vehicle's, and whose they are."""
+    spec = scenario.controller
+    if isinstance(spec, Bounded) and spec.input_bounds is not None:
+        return spec.input_bounds.actuators(vehicle), "controller.input_bounds"
+    return ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
+
+
 def _rate_loop(timestep: float) -> AutopilotSettings:
     """Return the settings of the autopilot of actions: a proportional rate loop, without filter and delay.
 
@@ -227,8 +229,8 @@ def check_action(action: Action, space: Box, *, bounded: bool = True) -> Array:
     numbers = np.array(action, np.float64)
     if not bounded:
         return numbers
-    room = ACTION_ROUNDING * (space.high - space.low)
-    outside = (numbers < space.low - room) | (numbers > space.high + room)  # False for NaN
+    tolerance = ACTION_ROUNDING * (space.high - space.low)
+    outside = (numbers < space.low - tolerance) | (numbers > space.high + tolerance)  # False for NaN
     if outside.any():
         first = tuple(np.argwhere(outside)[0].tolist())
         where = "".join(f"[{i}]" for i in first)

@@ -97,26 +97,22 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         """
         options: dict[str, Any] = {"action": action, "observation": observation, "preview": preview}
         self._single = QuadrotorEnv(scenario, vary=vary, **options)
-        for name, number in (("num_envs", num_envs), ("threads", threads), ("max_episode_steps", max_episode_steps)):
-            if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
-                raise ParameterError("", name, number, "a whole number of at least 1")
+        _require_whole("num_envs", num_envs)
+        _require_whole("threads", threads)
+        if max_episode_steps is not None:
+            _require_whole("max_episode_steps", max_episode_steps)
         if render_mode is not None:
             rule = "None: envs.flight(i).save(directory) films an episode of environment i"
             raise ParameterError("", "render_mode", render_mode, rule)
-        try:
-            self._autoreset = AutoresetMode(autoreset_mode)
-        except ValueError:
-            modes = ", ".join(mode.value for mode in AutoresetMode)
-            raise ParameterError("", "autoreset_mode", autoreset_mode, f"one of {modes}") from None
+        self._autoreset = _autoreset_mode(autoreset_mode)
         self.num_envs = int(num_envs)
         self.metadata = {**self.metadata, "autoreset_mode": self._autoreset}
         self._episodes = self._single.episodes
         self.scenario = self._episodes.base
         self.observations = self._single.observations
+        self.constraint_names: tuple[str, ...] = ()
         if margins:
             self.constraint_names = self._single.constraint_names
-        else:
-            self.constraint_names = ()
         self.single_action_space = self._single.action_space
         self.single_observation_space = self.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -127,11 +123,8 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         compiled = Margins(self._single.limits, self.scenario.plant.timestep).compiled
         if self.obstacle is None and margins and not compiled:
             self.obstacle = "a constraint whose margins Python computes"
-        if margins:
-            limits = len(self._single.constraint_names)
-        else:
-            limits = 0
-        self._frame = StepResults.empty(self.num_envs, len(self.observations.layout), limits)
+        entries = len(self.observations.layout)
+        self._frame = StepResults.empty(self.num_envs, entries, len(self.constraint_names))
         shared: dict[str, Any] = {"rewards": RewardHook(reward), "most": max_episode_steps}
         self._fleet: Fleet
         if self.obstacle is None:
@@ -417,6 +410,21 @@ class _ActionLog:
         for number in range(first, end):
             actions.append(self._steps[number - self._dropped][place])
         return episode, actions
+
+
+def _require_whole(name: str, number: object) -> None:
+    """Refuse an argument that is not a whole number of at least 1."""
+    if not (isinstance(number, int | np.integer) and number >= 1):
+        raise ParameterError("", name, number, "a whole number of at least 1")
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return a mode of Gymnasium by its name."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        modes = ", ".join(known.value for known in AutoresetMode)
+        raise ParameterError("", "autoreset_mode", mode, f"one of {modes}") from None
 
 
 def _masked(values: dict[str, Any], mask: Flags) -> dict[str, Any]:
