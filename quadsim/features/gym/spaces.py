@@ -229,8 +229,8 @@ def check_action(action: Action, space: Box, *, bounded: bool = True) -> Array:
     numbers = np.array(action, np.float64)
     if not bounded:
         return numbers
-    tolerance = ACTION_ROUNDING * (space.high - space.low)
-    outside = (numbers < space.low - tolerance) | (numbers > space.high + tolerance)  # False for NaN
+    rounding = ACTION_ROUNDING * (space.high - space.low)
+    outside = (numbers < space.low - rounding) | (numbers > space.high + rounding)  # False for NaN
     if outside.any():
         first = tuple(np.argwhere(outside)[0].tolist())
         where = "".join(f"[{i}]" for i in first)
