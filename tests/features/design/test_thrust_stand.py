@@ -219,12 +219,15 @@ def test_one_rotor_or_four_is_asked_where_thrust_leaves_a_doubt(
     assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--out", str(mine)]) == 2
     printed = capsys.readouterr()
     assert "--rotors must be stated, 1 or 4" in printed.err
+    assert "a vehicle of 0.716 kg would lift" in printed.err
     assert not mine.exists()
     for rotors, coefficient in (("4", 1.1e-5), ("1", 4.4e-5)):
         one = tmp_path / f"{rotors}.toml"
         command = ["vehicle", "hummingbird", "--thrust-stand", str(path), "--rotors", rotors, "--out", str(one)]
         assert main(command) == 0
         assert load_vehicle(one).thrust_coefficient == pytest.approx(coefficient, rel=1e-3)
+        text = one.read_text(encoding="utf-8")
+        assert ("12 rows of 4 rotors together, divided by 4" in text) == (rotors == "4")
     assert main(["vehicle", "hummingbird", "--rotors", "4"]) == 2
     assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--rotors", "3"]) == 2
 
