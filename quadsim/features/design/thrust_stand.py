@@ -10,7 +10,8 @@ CP rho n^2 D^5 / (2 pi), n = w / (2 pi).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -238,8 +239,10 @@ def stand_vehicle_text(
     rows = _rows_text(fit, rotors or 1)
     sources = _sources(fit, f"thrust stand {stand.name}, {rows}")
     replaced = [name for name in _MAPS if name in document and name not in numbers]
+    added = [name for name in numbers if name not in document]
+    document = tomlkit.parse(_with_tables(start, added, replaced))
     for name in replaced:
-        document.pop(name)
+        document.pop(name, None)
     for name, value in numbers.items():
         table: Any = document.get(name)
         if table is None:
@@ -255,6 +258,34 @@ def stand_vehicle_text(
     notes = [*fit.notes, *doubts]
     data = {**numbers, "thrust_error": fit.thrust_error, "torque_error": fit.torque_error, "notes": notes}
     return f"{head}\n{tomlkit.dumps(document)}", data
+
+
+def _with_tables(text: str, added: Iterable[str], replaced: Iterable[str]) -> str:
+    """Return a vehicle file's text whose comments stay above the tables that they explain.
+
+    Tables that are replaced become comments; comments that hold an added table become that table, to be filled in.
+    """
+    document = tomlkit.parse(text)
+    for name in replaced:
+        stated = _stated(name, document[name])
+        commented = "".join(f"# {line}" for line in stated.splitlines(keepends=True))
+        text = text.replace(stated, commented)
+    for name in added:
+        commented_table = rf"^# \[{name}\]\n(?:# (?:value|unit|source) = .*\n)+"
+        empty_table = f'[{name}]\nvalue = 0\nunit = "{_PARAMETER_UNITS[name]}"\nsource = ""\n'
+        text = re.sub(commented_table, empty_table, text, count=1, flags=re.MULTILINE)
+    return text
+
+
+def _stated(name: str, table: Any) -> str:
+    """Return the text of a table up to its last value, without the comments below, which are the next table's."""
+    text = f"[{name}]\n{table.as_string()}"
+    below = ""
+    for key, item in reversed(table.value.body):
+        if key is not None:
+            break
+        below = item.as_string() + below
+    return text.removesuffix(below)
 
 
 def _doubts(path: Path, tables: Mapping[str, Any]) -> tuple[str, ...]:

@@ -241,6 +241,29 @@ def test_its_coefficient_takes_the_place_of_a_map(tmp_path: Path) -> None:
     assert (vehicle.thrust_of_speed, vehicle.thrust_coefficient) == (None, 3.9e-8)
 
 
+def test_comments_stay_above_the_tables_that_they_explain(tmp_path: Path) -> None:
+    """A table takes the place of its example, what it replaces stays as a comment, and the next stand takes it back."""
+    template = quadsim.vehicle_report(template=True).content
+    throttle = stand(tmp_path / "throttle.csv", "throttle,thrust [N]", SHARES, LIFT)
+    mapped = quadsim.vehicle_report(thrust_stand=throttle).content
+    (tmp_path / "mapped.toml").write_text(mapped, encoding="utf-8")
+    speed = stand(tmp_path / "speed.csv", "speed [rad/s],thrust [N]", SPEEDS, B * SPEEDS**2)
+    back = quadsim.vehicle_report(tmp_path / "mapped.toml", thrust_stand=speed).content
+    assert (
+        "# May be left out: with thrust_coefficient or thrust_of_speed.\n[thrust_of_throttle]\nvalue = [2.0, 5.0]"
+        in mapped
+    )
+    assert "# [thrust_coefficient]\n# value = 1.5e-05\n" in mapped
+    assert (
+        "# May be left out: with thrust_of_speed or thrust_of_throttle.\n[thrust_coefficient]\nvalue = 1.1e-05" in back
+    )
+    explanations = [line for line in template.splitlines() if line.startswith(("# Find it", "# May be left out"))]
+    for text in (mapped, back):
+        assert [
+            line for line in text.splitlines() if line.startswith(("# Find it", "# May be left out"))
+        ] == explanations
+
+
 def test_a_stand_that_stops_below_full_throttle_says_so(tmp_path: Path) -> None:
     table = SPEEDS / 1000.0, SPEEDS, B * SPEEDS**2
     text = quadsim.vehicle_report(
