@@ -10,7 +10,8 @@ CP rho n^2 D^5 / (2 pi), n = w / (2 pi).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -231,14 +232,17 @@ def stand_vehicle_text(
     slowest = float(tables["speed_min"]["value"])
     fit = fit_stand(stand, rotors=rotors or 1, diameter=diameter, speed_min=slowest)
     if rotors is None:
-        _require_of_one(fit, float(tables["mass"]["value"]) * float(tables["gravity"]["value"]))
+        _require_of_one(fit, float(tables["mass"]["value"]), float(tables["gravity"]["value"]))
     numbers = _numbers(fit)
     if not fit.throttle_offset and "throttle_offset" not in document:
         numbers.pop("throttle_offset", None)
-    sources = _sources(fit, f"thrust stand {stand.name}, {len(fit.fitted)} rows")
+    rows = _rows_text(fit, rotors or 1)
+    sources = _sources(fit, f"thrust stand {stand.name}, {rows}")
     replaced = [name for name in _MAPS if name in document and name not in numbers]
+    added = [name for name in numbers if name not in document]
+    document = tomlkit.parse(_with_tables(start, added, replaced))
     for name in replaced:
-        document.pop(name)
+        document.pop(name, None)
     for name, value in numbers.items():
         table: Any = document.get(name)
         if table is None:
@@ -250,10 +254,38 @@ def stand_vehicle_text(
             table["value"] = _rounded(value)
         table["source"] = sources[name]
     doubts = _doubts(stand, document.unwrap())
-    head = "".join(f"# {line}\n" for line in (*_fit_lines(fit, stand.name, replaced), *doubts))
+    head = "".join(f"# {line}\n" for line in (*_fit_lines(fit, f"{stand.name}: {rows}", replaced), *doubts))
     notes = [*fit.notes, *doubts]
     data = {**numbers, "thrust_error": fit.thrust_error, "torque_error": fit.torque_error, "notes": notes}
     return f"{head}\n{tomlkit.dumps(document)}", data
+
+
+def _with_tables(text: str, added: Iterable[str], replaced: Iterable[str]) -> str:
+    """Return a vehicle file's text whose comments stay above the tables that they explain.
+
+    Tables that are replaced become comments; comments that hold an added table become that table, to be filled in.
+    """
+    document = tomlkit.parse(text)
+    for name in replaced:
+        stated = _stated(name, document[name])
+        commented = "".join(f"# {line}" for line in stated.splitlines(keepends=True))
+        text = text.replace(stated, commented)
+    for name in added:
+        commented_table = rf"^# \[{name}\]\n(?:# (?:value|unit|source) = .*\n)+"
+        empty_table = f'[{name}]\nvalue = 0\nunit = "{_PARAMETER_UNITS[name]}"\nsource = ""\n'
+        text = re.sub(commented_table, empty_table, text, count=1, flags=re.MULTILINE)
+    return text
+
+
+def _stated(name: str, table: Any) -> str:
+    """Return the text of a table up to its last value, without the comments below, which are the next table's."""
+    text = f"[{name}]\n{table.as_string()}"
+    below = ""
+    for key, item in reversed(table.value.body):
+        if key is not None:
+            break
+        below = item.as_string() + below
+    return text.removesuffix(below)
 
 
 def _doubts(path: Path, tables: Mapping[str, Any]) -> tuple[str, ...]:
@@ -311,16 +343,25 @@ def _rising(columns: Mapping[str, Array], table: StandTable) -> tuple[Array, tup
     return kept, (f"left out as saturated, thrust no longer rises with the {by}: row {rows}",)
 
 
-def _require_of_one(fit: StandFit, weight: float) -> None:
+def _rows_text(fit: StandFit, rotors: int) -> str:
+    """Return how many rows were fitted, and of how many rotors."""
+    rows = len(fit.fitted)
+    if rotors == 1:
+        return f"{rows} rows of one rotor"
+    return f"{rows} rows of {rotors} rotors together, divided by {rotors}"
+
+
+def _require_of_one(fit: StandFit, mass: float, gravity: float) -> None:
     """Ask how many rotors a table is of, where one of them would be stronger than those of vehicles are."""
-    strongest = float(fit.columns["thrust"].max()) / weight
+    strongest = float(fit.columns["thrust"].max()) / (mass * gravity)
     if strongest < _STRONGEST - TIE_SHARE:
         return
     each = N_ROTORS * strongest
     together = strongest
     raise InputError(
-        f"--rotors must be stated, 1 or {N_ROTORS}, the rotors that the stand's table is of: the vehicle would lift "
-        f"{each:.1f} times its weight with a table of one, {together:.1f} times with a table of {N_ROTORS}"
+        f"--rotors must be stated, 1 or {N_ROTORS}, the rotors that the stand's table is of: a vehicle of "
+        f"{mass:.4g} kg would lift {each:.1f} times its weight with a table of one, {together:.1f} times with one of "
+        f"{N_ROTORS}"
     )
 
 
@@ -355,10 +396,10 @@ def _sources(fit: StandFit, of: str) -> dict[str, str]:
     return sources
 
 
-def _fit_lines(fit: StandFit, name: str, replaced: list[str]) -> list[str]:
+def _fit_lines(fit: StandFit, rows: str, replaced: list[str]) -> list[str]:
     """Return the fit as lines of text: what was fitted, what was left out or replaced, and each row."""
     lines = [
-        f"Fit to {name}: {len(fit.fitted)} rows of one rotor, to {fit.thrust_error:.1%} of the largest thrust (RMS)",
+        f"Fit to {rows}, to {fit.thrust_error:.1%} of the largest thrust (RMS)",
         *_law_lines(fit),
         *fit.notes,
     ]

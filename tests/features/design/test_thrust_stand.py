@@ -219,12 +219,15 @@ def test_one_rotor_or_four_is_asked_where_thrust_leaves_a_doubt(
     assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--out", str(mine)]) == 2
     printed = capsys.readouterr()
     assert "--rotors must be stated, 1 or 4" in printed.err
+    assert "a vehicle of 0.716 kg would lift" in printed.err
     assert not mine.exists()
     for rotors, coefficient in (("4", 1.1e-5), ("1", 4.4e-5)):
         one = tmp_path / f"{rotors}.toml"
         command = ["vehicle", "hummingbird", "--thrust-stand", str(path), "--rotors", rotors, "--out", str(one)]
         assert main(command) == 0
         assert load_vehicle(one).thrust_coefficient == pytest.approx(coefficient, rel=1e-3)
+        text = one.read_text(encoding="utf-8")
+        assert ("12 rows of 4 rotors together, divided by 4" in text) == (rotors == "4")
     assert main(["vehicle", "hummingbird", "--rotors", "4"]) == 2
     assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--rotors", "3"]) == 2
 
@@ -236,6 +239,29 @@ def test_its_coefficient_takes_the_place_of_a_map(tmp_path: Path) -> None:
     mine.write_text(quadsim.vehicle_report(FILES / "cf21b.toml", thrust_stand=path).content, encoding="utf-8")
     vehicle = load_vehicle(mine)
     assert (vehicle.thrust_of_speed, vehicle.thrust_coefficient) == (None, 3.9e-8)
+
+
+def test_comments_stay_above_the_tables_that_they_explain(tmp_path: Path) -> None:
+    """A table takes the place of its example, what it replaces stays as a comment, and the next stand takes it back."""
+    template = quadsim.vehicle_report(template=True).content
+    throttle = stand(tmp_path / "throttle.csv", "throttle,thrust [N]", SHARES, LIFT)
+    mapped = quadsim.vehicle_report(thrust_stand=throttle).content
+    (tmp_path / "mapped.toml").write_text(mapped, encoding="utf-8")
+    speed = stand(tmp_path / "speed.csv", "speed [rad/s],thrust [N]", SPEEDS, B * SPEEDS**2)
+    back = quadsim.vehicle_report(tmp_path / "mapped.toml", thrust_stand=speed).content
+    assert (
+        "# May be left out: with thrust_coefficient or thrust_of_speed.\n[thrust_of_throttle]\nvalue = [2.0, 5.0]"
+        in mapped
+    )
+    assert "# [thrust_coefficient]\n# value = 1.5e-05\n" in mapped
+    assert (
+        "# May be left out: with thrust_of_speed or thrust_of_throttle.\n[thrust_coefficient]\nvalue = 1.1e-05" in back
+    )
+    explanations = [line for line in template.splitlines() if line.startswith(("# Find it", "# May be left out"))]
+    for text in (mapped, back):
+        assert [
+            line for line in text.splitlines() if line.startswith(("# Find it", "# May be left out"))
+        ] == explanations
 
 
 def test_a_stand_that_stops_below_full_throttle_says_so(tmp_path: Path) -> None:
