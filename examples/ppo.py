@@ -221,7 +221,9 @@ class Learner:
             self.update(rollout, self.settings.learning_rate * (1.0 - fallen))
             self.note(rollout)
             if report and (update % 20 == 19 or update == updates - 1):
-                print(self.curve[-1], flush=True)
+                point = self.curve[-1]
+                learned = f"reward {point.reward:.3f}, RMS error {point.error:.3f} m, {point.lost} episodes lost"
+                print(f"{point.steps} steps: {learned}", flush=True)
 
     def fly(self) -> Rollout:
         """Fly `length` steps of each environment by the policy, with exploration."""

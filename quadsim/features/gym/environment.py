@@ -116,7 +116,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         horizon = self._base.controller.horizon
         if preview is None:
             preview = horizon
-        if not 1 <= preview <= horizon:
+        if not (isinstance(preview, int | np.integer) and 1 <= preview <= horizon):
             raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
         self.observations = Observations(observation, preview)

@@ -6,7 +6,7 @@ the scenario, and a flight of the campaign gives the values of `[[vary]]`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -68,6 +68,9 @@ class Episodes:
         if vary is not None:
             if isinstance(vary, str | Path):
                 vary = str(vary)
+            elif isinstance(vary, Mapping) or not isinstance(vary, Iterable):
+                rule = "a campaign's name or file, or a list of tables as of its [[vary]]"
+                raise ParameterError("", "vary", vary, rule)
             self._plan = commands_of("campaign").drawn_flights(loaded, vary)
             loaded = self._plan.scenario
         self.base = loaded

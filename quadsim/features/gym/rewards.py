@@ -36,7 +36,11 @@ def nearness(state: Array, reference: Array, speeds: Array) -> Array:
 
 
 class RewardHook:
-    """A reward function, called with the margins where it takes them."""
+    """A reward function, called with the margins where it takes them.
+
+    Attributes:
+        takes_margins: whether it has a parameter `margins`.
+    """
 
     def __init__(self, reward: Reward) -> None:
         """Wrap a function.
@@ -51,11 +55,11 @@ class RewardHook:
         try:
             signature = inspect.signature(reward)
         except (TypeError, ValueError):  # compiled, without a signature
-            self._takes_margins = False
+            self.takes_margins = False
             return
-        self._takes_margins = "margins" in signature.parameters
+        self.takes_margins = "margins" in signature.parameters
         keywords: dict[str, None] = {}
-        if self._takes_margins:
+        if self.takes_margins:
             keywords["margins"] = None
         try:
             signature.bind(None, None, None, **keywords)
@@ -63,8 +67,15 @@ class RewardHook:
             raise ParameterError("", "reward", f"{getattr(reward, '__name__', '')}{signature}", rule) from None
 
     def of_one(self, state: Array, reference: Array, speeds: Array, margins: Mapping[str, float]) -> float:
-        """Return the reward of an environment."""
-        return float(self._call(state, reference, speeds, margins))
+        """Return the reward of an environment.
+
+        Raises:
+            ParameterError: the function returned something else.
+        """
+        reward = self._call(state, reference, speeds, margins)
+        if reward is None or np.ndim(reward) > 0:
+            raise ParameterError("", "reward", reward, "a function that returns one number for one environment")
+        return float(reward)
 
     def of_many(self, states: Array, references: Array, speeds: Array, margins: Mapping[str, Array]) -> Array:
         """Return N rewards.
@@ -79,6 +90,6 @@ class RewardHook:
         return rewards
 
     def _call(self, states: Array, references: Array, speeds: Array, margins: Mapping[str, Any]) -> Any:
-        if self._takes_margins:
+        if self.takes_margins:
             return self._reward(states, references, speeds, margins=margins)
         return self._reward(states, references, speeds)

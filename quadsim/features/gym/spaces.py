@@ -310,6 +310,8 @@ class Observations:
     """
 
     def __init__(self, parts: Sequence[str], preview: int) -> None:
+        if isinstance(parts, str):
+            raise ParameterError("", "observation", parts, 'a list of parts, such as ["state"]')
         if not parts or len(set(parts)) < len(parts):
             raise ParameterError("", "observation", list(parts), f"one or more of {', '.join(PARTS)}, once each")
         for part in parts:

@@ -125,7 +125,10 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             self.obstacle = "a constraint whose margins Python computes"
         entries = len(self.observations.layout)
         self._frame = StepResults.empty(self.num_envs, entries, len(self.constraint_names))
-        shared: dict[str, Any] = {"rewards": RewardHook(reward), "most": max_episode_steps}
+        rewards = RewardHook(reward)
+        if rewards.takes_margins and not margins:
+            raise ParameterError("", "margins", margins, "True for a reward with a parameter margins")
+        shared: dict[str, Any] = {"rewards": rewards, "most": max_episode_steps}
         self._fleet: Fleet
         if self.obstacle is None:
             self._fleet = Together(self._single, self.num_envs, margins=margins, threads=threads, **shared)

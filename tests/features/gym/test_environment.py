@@ -247,7 +247,11 @@ SLOW = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150
         ({"action": "torque"}, "no action named 'torque'"),
         ({"observation": ("wind",)}, "no part of the observation named 'wind'"),
         ({"observation": ()}, "observation must be one or more"),
+        ({"observation": "state"}, "observation must be a list of parts.*got 'state'"),
         ({"preview": 51}, "preview must be from 1 to controller.horizon = 50"),
+        ({"preview": 1.5}, "preview must be from 1 to controller.horizon = 50.*got 1.5"),
+        ({"vary": 3}, "vary must be a campaign's name or file, or a list of tables.*got 3"),
+        ({"vary": {"name": "mass"}}, "vary must be a campaign's name or file, or a list of tables"),
         ({"render_mode": "ansi"}, "render_mode must be rgb_array"),
         ({"scenario": SLOW}, "below and above the hover speed"),
     ],
@@ -255,6 +259,15 @@ SLOW = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150
 def test_a_wrong_option_is_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         quadsim.gym.QuadrotorEnv(**{"scenario": "hover", **options})
+
+
+@pytest.mark.parametrize("returned", [None, np.zeros(12)])
+def test_a_reward_that_is_not_one_number_is_refused(returned: Any) -> None:
+    env = quadsim.gym.QuadrotorEnv("hover", reward=lambda state, reference, speeds: returned)
+    env.reset(seed=0)
+    with pytest.raises(ParameterError, match="reward must be a function that returns one number"):
+        env.step(np.zeros(4, np.float32))
+    env.close()
 
 
 def test_wrong_arguments_are_named() -> None:

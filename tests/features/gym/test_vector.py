@@ -348,6 +348,8 @@ def test_rewards_may_use_margins() -> None:
     envs.close()
     with pytest.raises(ParameterError, match="function of state"):
         quadsim.gym.make_vec(scenario, 2, reward=lambda state: 1.0)
+    with pytest.raises(ParameterError, match="margins must be True for a reward"):
+        quadsim.gym.make_vec(scenario, 2, margins=False, reward=lambda state, reference, speeds, margins: state[..., 2])
 
 
 def test_a_flight_of_one_of_them_is_flown_again_by_its_actions() -> None:
