@@ -55,6 +55,7 @@ MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is hel
 ROUNDED_DECIMALS: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
 TableFactor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
+OTHER_SEPARATORS: Final = {";": "semicolons", "\t": "tabs", " ": "spaces"}  # refused
 QUATERNION_TOLERANCE: Final = 0.01  # largest difference of a quaternion's length from 1
 LARGEST_GAP: Final = 0.01  # between a piece and the next [m, rad]
 
@@ -229,6 +230,9 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
         raise FileError(path, "row 1: must be a header, such as t,x,y,z,yaw; the file is empty")
     known = table_format(header)
     if known is None:
+        separator = _foreign_separator(header)
+        if separator is not None:
+            raise FileError(path, f"row 1: columns must be separated by commas; they are by {separator}")
         raise FileError(path, f"row 1: no known header, of {len(header)} columns; {nearest_format(header)}")
     kind, places = known
     fewest_rows = 2
@@ -257,6 +261,16 @@ def _read_cells(path: FilePath, content: bytes) -> list[list[str]]:
     if rows and len(rows[0]) > 1 and not any(row[-1].strip() for row in rows if row):
         return [row[:-1] for row in rows]  # lines that end with a comma
     return rows
+
+
+def _foreign_separator(header: Sequence[str]) -> str | None:
+    """Return what separates a header's columns where no comma does; None if nothing does."""
+    if len(header) > 1:
+        return None
+    for separator, name in OTHER_SEPARATORS.items():
+        if separator in header[0]:
+            return name
+    return None
 
 
 def _table_of_rows(

@@ -163,6 +163,16 @@ def test_a_refusal_names_the_nearest_format(tmp_path: Path, header: str, parts: 
     assert all(before < after for before, after in pairwise(places))
 
 
+@pytest.mark.parametrize(("separator", "name"), [(";", "semicolons"), ("\t", "tabs"), (" ", "spaces")])
+def test_columns_that_no_comma_separates_are_refused_by_their_separator(
+    tmp_path: Path, separator: str, name: str
+) -> None:
+    path = tmp_path / "course.csv"
+    path.write_text(f"{separator.join('txyz')}\n", encoding="utf-8")
+    with pytest.raises(FileError, match=f"row 1: columns must be separated by commas; they are by {name}"):
+        read_course_table(path)
+
+
 def test_a_header_is_not_quoted() -> None:
     assert "secret" not in nearest_format(["t", "x", "secret"])
 
