@@ -17,6 +17,7 @@ import json
 import logging
 import os
 import re
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -394,8 +395,9 @@ def _first_names(names: Sequence[str]) -> str:
 def _beside(target: Path) -> Iterator[Path]:
     """A temporary folder beside a target; errors about its contents name them as if they were in the target."""
     with _system_errors_named(target):
-        work = Path(tempfile.mkdtemp(prefix=".quadsim-", suffix=".partial", dir=target.parent))
+        work = target.parent / f".quadsim-{secrets.token_hex(4)}.partial"
         try:
+            work.mkdir(0o700)  # within the try: a signal may come as soon as it is there
             yield work
         except OutputError as error:
             if not error.path.is_relative_to(work):

@@ -440,8 +440,9 @@ def _too_wide(name: str, scale: float | None, half: float, value: float) -> str:
     if scale is not None:
         relative = half * scale / abs(value)
     if relative > WIDEST:
-        width = f"+-{np.expm1(relative):.0%}"
-        if relative >= _WIDEST_SAID:
+        if relative < _WIDEST_SAID:
+            width = f"+-{np.expm1(relative):.0%}"
+        else:  # it may be too large for an exponential
             width = f"more than +-{np.expm1(_WIDEST_SAID):.0%}"
         return f"{_NOT_EXCITED}: the interval is {width}, allowed {np.expm1(WIDEST):.0%}"
     return ""
