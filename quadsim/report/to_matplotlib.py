@@ -422,10 +422,18 @@ def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
         axes.set_title(panel.heading)
         y_label = panel.y_label
     else:
-        y_label = textwrap.fill(panel.heading, letters)
+        y_label = _wrapped(panel.heading, letters)
     axes.set(xlabel=panel.x_label, ylabel=y_label)
     entries.pop("", None)
     return entries
+
+
+def _wrapped(heading: str, letters: int) -> str:
+    """Return a heading in lines of so many letters; a name that is longer than a line breaks at its underscores."""
+    longest = max(map(len, heading.split()), default=0)
+    if longest <= letters:
+        return textwrap.fill(heading, letters)
+    return textwrap.fill(heading.replace("_", "_ "), letters).replace("_ ", "_")
 
 
 def _draw_label(axes: Axes, label: Label) -> None:

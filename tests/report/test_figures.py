@@ -293,6 +293,14 @@ def test_an_angle_has_a_gap_at_each_wrap_and_only_there() -> None:
     assert break_at_wraps(t, wrapped, "rad/s")[1].size == t.size
 
 
+def test_a_name_longer_than_its_axis_breaks_at_its_underscores() -> None:
+    line = Series(x=np.arange(3.0), y=np.arange(3.0), colour="#123456", label="a")
+    panel = Panel(title="vertical_acceleration_of_the_thrust", unit="m/s^2", series=(line,))
+    label = draw(Figure(key="k", title="t", panels=(panel,) * 6, columns=1)).axes[0].get_ylabel()
+    assert "_\n" in label
+    assert label.replace("_\n", "_").replace("\n", " ") == panel.heading
+
+
 def test_a_user_s_own_settings_change_no_figure_and_its_texts_are_literal() -> None:
     """With `text.usetex` a figure would need LaTeX, and `$` would open a formula."""
     series = (Series(x=np.arange(3.0), y=np.arange(3.0), colour="#000000", label="$\\frac"),)
