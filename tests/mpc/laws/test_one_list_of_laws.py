@@ -103,7 +103,8 @@ def test_commands_of_the_example_print_what_it_shows(command: str, answers: dict
 
 
 def test_the_test_of_the_example_passes(copy: Path) -> None:
-    printed = run_python(copy, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "test_pd.py")
+    alone = ("-p", "no:cacheprovider", "-c", os.devnull, "--confcutdir=.")  # looks at no folder above the copy
+    printed = run_python(copy, "-m", "pytest", "-q", *alone, "test_pd.py")
     assert "2 passed" in printed
     assert "ends with `2 passed`" in EXAMPLE
 
