@@ -47,6 +47,10 @@ _LEAST_OFFSET: Final = -1.0
 """Least `throttle_offset`: without throttle the rotors turn at half their largest speed."""
 _MOST_OFFSET: Final = 0.9
 """Largest `throttle_offset`: below nine tenths of the throttle the rotors stand still."""
+_ROUNDING: Final = 1e-12
+"""Share by which the moments of inertia of a flat body may exceed their limit."""
+_SINGULAR: Final = 1e-9
+"""Determinant of the effects of four unit thrusts, see `Vehicle._effect_of_thrusts`, that counts as 0."""
 SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
@@ -169,7 +173,7 @@ class Vehicle:
         self._check_hover()
 
     def _check_ranges(self) -> None:
-        """Refuse a number outside the range that it has beyond its sign."""
+        """Refuse numbers outside the limits that their parameters have of their own."""
         if self.rate_damping is not None and min(self.rate_damping) < 0.0:
             self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
         if self.inflow is not None and self.inflow < 0.0:
@@ -189,11 +193,11 @@ class Vehicle:
 
     def _check_inertia(self) -> None:
         """Refuse moments of inertia that no rigid body has."""
-        if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + 1e-12):
+        if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + _ROUNDING):
             self._refuse("inertia", "such that no moment exceeds the sum of the other two")
         if self.products_of_inertia is not None:
             moments = np.linalg.eigvalsh(self.inertia_matrix)
-            if not moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-12):
+            if not moments[2] <= (moments[0] + moments[1]) * (1.0 + _ROUNDING):
                 self._refuse("products_of_inertia", "such that no principal moment exceeds the sum of the other two")
 
     def __repr__(self) -> str:
@@ -210,6 +214,7 @@ class Vehicle:
         return f"<Vehicle {self.name}: {', '.join(parts)}{about}>"
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
+        """Raise the error of a parameter that must follow a rule."""
         raise ParameterError("vehicle", name, getattr(self, name), rule)
 
     def _check_layout(self) -> None:
@@ -252,7 +257,7 @@ class Vehicle:
     def _layout_problem(self, spins: Sequence[float] | Array) -> str | None:
         """Return the missing property of the layout with these spins; None if it is complete."""
         effect = self._effect_of_thrusts(spins)
-        if abs(np.linalg.det(effect)) < 1e-9:
+        if abs(np.linalg.det(effect)) < _SINGULAR:
             return "a layout that controls roll, pitch, yaw and thrust"
         if _hover_shares(effect).min() < LEAST_SHARE:
             return "a layout in which every rotor lifts while the torques cancel, so that it can hover"
@@ -376,13 +381,14 @@ class Vehicle:
         a1, a2 = self.thrust_of_speed
         # The root of a_1 w + a_2 w^2 = f; beyond the largest thrust of a map with a_2 < 0, that of the largest.
         root = np.sqrt(np.maximum(a1**2 + 4.0 * a2 * thrusts, 0.0))
-        if a1 > 0.0:  # this form holds for a_2 = 0 too, and does not cancel
+        if a1 > 0.0:  # this form also holds for a_2 = 0, and subtracts no numbers that are nearly equal
             return np.asarray(2.0 * thrusts / (a1 + root))
         return np.asarray((root - a1) / (2.0 * a2))
 
     def level_thrust(self, speed: float) -> float:
         """Return the collective thrust [N], without torque, at which the fastest rotor has a speed [rad/s]."""
-        return float((self.thrusts(np.full(N_ROTORS, speed)) / self.thrust_shares).min())
+        thrusts = self.thrusts(np.full(N_ROTORS, speed))
+        return float((thrusts / self.thrust_shares).min())
 
     @property
     def throttle_share(self) -> float:

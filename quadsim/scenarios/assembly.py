@@ -224,7 +224,7 @@ class Assembly:
         return scenario.written(with_stated_events)
 
     def audited(self) -> Assembly:
-        """Return the assembly with the bounds of a user's controller, which builds it, as constraints."""
+        """Return the assembly with the bounds of a user's controller as constraints; it builds that controller."""
         if not isinstance(self.scenario.controller, Plugin):
             return self
         return self.with_user_bounds(self.controller())
@@ -233,7 +233,10 @@ class Assembly:
 
     @cached_property
     def vehicle(self) -> Vehicle:
-        """The modelled vehicle: its file with the scenario's overrides; a resolved scenario needs no file."""
+        """The modelled vehicle: its file with the scenario's numbers in place of the file's.
+
+        A resolved or recorded scenario has every number, and needs no file.
+        """
         file = self.scenario.vehicle.file
         overrides = self._overrides
         try:
@@ -285,11 +288,12 @@ class Assembly:
             ParameterError: the vehicle is impossible.
         """
         modelled = self.vehicle
-        if "throttle_offset" in self._actual_parameters:
+        parameters = self._actual_parameters
+        if "throttle_offset" in parameters:
             rule = "absent: the plant takes rotor speeds, only logs have a throttle"
-            raise ParameterError("actual", "throttle_offset", self._actual_parameters["throttle_offset"], rule)
+            raise ParameterError("actual", "throttle_offset", parameters["throttle_offset"], rule)
         try:
-            return altered(modelled, self._actual_parameters)
+            return altered(modelled, parameters)
         except ParameterError as error:
             raise ParameterError("actual", error.name, error.value, error.rule) from None
 
@@ -587,7 +591,7 @@ class Assembly:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """The controller's bounds on signals of the audit, in file units, cut to speeds that the rotors can have.
+        """The controller's bounds on signals of the audit, in file units; those on speeds within the rotors' range.
 
         See `quadsim.mpc.tables.controller.ControllerTable.audited`.  Audit, notes and feasibility all take these.
         """

@@ -45,14 +45,11 @@ def checked(assembly: Assembly) -> Assembly:
 
 
 def _check_effects(assembly: Assembly) -> None:
-    """Reject a vehicle that cannot hover, and effects that are impossible with it or with the integrator.
-
-    The parts are built for their own checks, and kept or dropped.
-    """
+    """Reject a vehicle that cannot hover, and effects that are impossible with it or with the integrator."""
     scenario = assembly.scenario
     load = assembly.effects.load or Load()
-    mass_properties(assembly.actual, load, load.payloads)
-    _ = assembly.moving_air
+    mass_properties(assembly.actual, load, load.payloads)  # refuses what is no rigid body
+    _ = assembly.moving_air  # refuses wind that has nothing to push
     changes = assembly.changes()
     if scenario.plant.integrator == "rk4":
         check_free(assembly.effects, changes, scenario.obstacles)

@@ -252,7 +252,7 @@ class Scenario:
         until: float | None = getattr(self.reference, "until", None)
         if until is None:
             raise ValueError("duration is missing")
-        periods = math.ceil(until / self.control_period - 1e-6)
+        periods = math.ceil(until / self.control_period - 1e-6)  # an excess by rounding makes no period
         duration = round(periods * self.control_period, 9)
         if duration > LONGEST_FLIGHT:
             raise ValueError(f"duration must be <= {LONGEST_FLIGHT}; the course takes {duration}")
@@ -318,7 +318,7 @@ class Scenario:
     def recording(self, vehicle: VehicleTable, autopilot: AutopilotSettings | None) -> Scenario:
         """Return the scenario with these tables, in which it repeats the numbers of its vehicle's file."""
         record = self.recorded
-        if record is None:
+        if record is None:  # what the tables have so far is the scenario's own
             record = RecordedVehicle(file=self.vehicle.file, stated=tuple(self._numbers_of_vehicle()))
         return self.altered(vehicle=vehicle, autopilot=autopilot, recorded=record)
 
