@@ -2,7 +2,7 @@
 
 A settings dataclass is the only declaration of its fields: type and limits by `annotated_types`, unit and meaning by
 `annotated_types.doc`, default value.  `quadsim.scenarios.schema` reads tables of scenario files into these dataclasses,
-and derives messages, the JSON Schema and commented files from them.  Numbers are therefore in file units, angles in
+and derives messages, the JSON Schema and commented files from them.  Numbers stay in the units of the file, angles in
 degrees; the code that computes with them converts them.
 """
 
@@ -18,9 +18,10 @@ from quadsim.errors import ParameterError
 
 Declaration = TypeVar("Declaration")
 
-SMALLEST: Final = 1e-12
 FLOORS: Final = {"s": 1e-6, "m": 1e-6, "kg": 1e-6, "Hz": 1e-6}
-"""Least positive number of a unit, and of any other: what is smaller means nothing here, and its inverse overflows."""
+"""Least positive number of a unit: a smaller one has no meaning for a quadrotor, and its inverse may overflow."""
+SMALLEST: Final = 1e-12
+"""Least positive number of every other unit."""
 
 Number = Annotated[float, Ge(-1e6), Le(1e6)]
 NonNegative = Annotated[float, Ge(0.0), Le(1e6)]
@@ -42,7 +43,7 @@ def floor_of(unit: str) -> float:
 
 
 def require_floor(settings: object, *names: str, unit: str) -> None:
-    """Refuse fields that may be 0, for none, and are smaller than any that means something.
+    """Refuse positive numbers below the floor of a unit in fields that may also be 0 or None.
 
     Raises:
         ParameterError: one is between 0 and the unit's floor.
@@ -55,7 +56,7 @@ def require_floor(settings: object, *names: str, unit: str) -> None:
 
 
 def filled(settings: Declaration, **values: object) -> Declaration:
-    """Return settings with the fields that are None set to `values`."""
+    """Return settings with those of the named fields that are None set to the given values."""
     absent: dict[str, Any] = {}
     for name, value in values.items():
         if getattr(settings, name) is None:

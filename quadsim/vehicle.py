@@ -36,16 +36,21 @@ ARMS: Final = ("arm_length", "rotor_azimuths")
 THRUST: Final = ("thrust_coefficient", "thrust_of_speed", "thrust_of_throttle")
 """The parameters of which one states a rotor's thrust."""
 AIR_MOMENT: Final = ("rotor_moment", "inflow_moment", "rate_damping", "inflow")
-"""The parameters that a controller or an estimator knows by its field `moment`."""
+"""The parameters that a controller or an estimator models where its field `moment` is true."""
 LARGEST: Final = 1e6
 """Largest magnitude of a vehicle's numbers: larger ones overflow."""
 LEAST_SHARE: Final = 1e-3
 """Least share of the weight that a rotor carries in hover."""
 BALANCED: Final = 1e-9
-"""Largest torque of four equal thrusts, per arm or drag_to_thrust, that counts as none."""
+"""Largest torque of four unit thrusts, per longest arm or per drag_to_thrust, that counts as none."""
 _LEAST_OFFSET: Final = -1.0
+"""Least `throttle_offset`: without throttle the rotors turn at half their largest speed."""
 _MOST_OFFSET: Final = 0.9
-"""Of `throttle_offset`: rotors at half their largest speed without throttle, and at rest below nearly all of it."""
+"""Largest `throttle_offset`: below nine tenths of the throttle the rotors stand still."""
+_ROUNDING: Final = 1e-12
+"""Share by which the moments of inertia of a flat body may exceed their limit."""
+_SINGULAR: Final = 1e-9
+"""Determinant of the effects of four unit thrusts, see `Vehicle._effect_of_thrusts`, that counts as 0."""
 SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
@@ -59,14 +64,17 @@ class Vehicle:
     `thrust_coefficient` has four numbers.  The rotors are placed by arms, or by `rotor_positions`.  They turn at
     `hover_speeds` in hover, which are equal only where their torques then cancel.
 
-    A map may replace `thrust_coefficient`.  `thrust_of_throttle`, T(u) = a_1 u + a_2 u^2 of the throttle u, gives
-    b = T(1) / speed_max^2; identification starts from the speeds sqrt(T(u) / b) that it gives a throttle.  With a
-    `throttle_offset` u_0, v = (u - u_0) / (1 - u_0) takes the place of u, and a rotor stands still while v < 0; without
-    a map of the throttle the speed is v speed_max.
-    `thrust_of_speed`, f(w) = a_1 w + a_2 w^2, is what the plant flies, reaction torque and power in proportion; a rotor
-    so slow that f is negative gives no thrust.  The autopilot and the allocation of a wrench invert it.  Where MPC and
-    estimator model b w^2, each rotor has the b of hover, f(w_i) / w_i^2: their trim is exact, and the slope of the
-    linear model, a_1 + 2 a_2 w_i, too.
+    A map of thrust may replace `thrust_coefficient`.
+
+    `thrust_of_throttle`, T(u) = a_1 u + a_2 u^2 of the throttle u, gives b = T(1) / speed_max^2.  Identification starts
+    from the speeds sqrt(T(u) / b) that the map gives for the logged throttle.  With a `throttle_offset` u_0,
+    v = (u - u_0) / (1 - u_0) takes the place of u, and a rotor stands still while v < 0; without a map of the throttle
+    the speed is v speed_max.
+
+    `thrust_of_speed`, f(w) = a_1 w + a_2 w^2, is what the plant flies.  Reaction torque and power are in proportion to
+    f, and a rotor so slow that f is negative gives no thrust.  The autopilot and the allocation of a wrench invert f.
+    MPC and estimator model b w^2; they take for b of each rotor that of hover, f(w_i) / w_i^2, so that their trim is
+    exact.  The linear model has the slope of f itself, a_1 + 2 a_2 w_i.
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
     (Martin and Salaun, 2010; Furrer et al., 2016).  The same velocity v turns the vehicle, by (rotor_moment[0] w v_y,
@@ -158,30 +166,39 @@ class Vehicle:
             if value is None and name in OPTIONAL_PARAMETERS:
                 continue
             object.__setattr__(self, name, _checked_parameter(name, value))
-        if min(self.rate_damping or (0.0,)) < 0.0:
+        self._check_ranges()
+        self._check_inertia()
+        self._check_layout()
+        self._check_thrust()
+        self._check_hover()
+
+    def _check_ranges(self) -> None:
+        """Refuse numbers outside the limits that their parameters have of their own."""
+        if self.rate_damping is not None and min(self.rate_damping) < 0.0:
             self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
-        if (self.inflow or 0.0) < 0.0:
+        if self.inflow is not None and self.inflow < 0.0:
             self._refuse("inflow", ">= 0 N s^2/(m rad)")
-        if not _LEAST_OFFSET <= (self.throttle_offset or 0.0) <= _MOST_OFFSET:
+        if self.throttle_offset is not None and not _LEAST_OFFSET <= self.throttle_offset <= _MOST_OFFSET:
             self._refuse("throttle_offset", f"between {_LEAST_OFFSET:g} and {_MOST_OFFSET:g}, a share of full throttle")
         if self.speed_min < 0.0:
             self._refuse("speed_min", ">= 0 rad/s")
         if self.speed_min >= self.speed_max:
             self._refuse("speed_min", f"below speed_max = {self.speed_max}")
         for name in ("rotor_rise", "rotor_fall"):
-            if (getattr(self, name) or 0.0) > SLOWEST_ROTOR:
+            time_constant = getattr(self, name)
+            if time_constant is not None and time_constant > SLOWEST_ROTOR:
                 self._refuse(name, f"above 0 and at most {SLOWEST_ROTOR:g} s, usually 0.01 to 0.3 s")
         if any(abs(spin) != 1 for spin in self.rotor_spins):
             self._refuse("rotor_spins", "four values, each 1 or -1")
-        if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + 1e-12):
+
+    def _check_inertia(self) -> None:
+        """Refuse moments of inertia that no rigid body has."""
+        if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + _ROUNDING):
             self._refuse("inertia", "such that no moment exceeds the sum of the other two")
         if self.products_of_inertia is not None:
             moments = np.linalg.eigvalsh(self.inertia_matrix)
-            if not moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-12):
+            if not moments[2] <= (moments[0] + moments[1]) * (1.0 + _ROUNDING):
                 self._refuse("products_of_inertia", "such that no principal moment exceeds the sum of the other two")
-        self._check_layout()
-        self._check_thrust()
-        self._check_hover()
 
     def __repr__(self) -> str:
         lift = self.level_thrust(self.speed_max) / (self.mass * self.gravity)
@@ -197,27 +214,16 @@ class Vehicle:
         return f"<Vehicle {self.name}: {', '.join(parts)}{about}>"
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
+        """Raise the error of a parameter that must follow a rule."""
         raise ParameterError("vehicle", name, getattr(self, name), rule)
 
     def _check_layout(self) -> None:
-        arms = [name for name in ARMS if getattr(self, name) is not None]
-        if self.rotor_positions is not None and arms:
-            self._refuse("rotor_positions", f"left out where {' and '.join(arms)} is given: one or the other")
-        if max(map(abs, self.rotor_azimuths or (0.0,))) > 360.0:
-            self._refuse("rotor_azimuths", "within -360 and 360 deg")
-        if self.rotor_positions is None and not arms:
-            self._refuse(ARMS[0], f"given with {ARMS[1]}, or rotor_positions in place of both")
-        if self.rotor_positions is None and len(arms) < len(ARMS):
-            (absent,) = {*ARMS} - {*arms}
-            self._refuse(absent, f"given with {arms[0]}, or rotor_positions in place of both")
-        if not self.longest_arm >= FLOORS["m"]:
-            self._refuse("rotor_positions", "away from the centre of mass")
+        """Refuse rotors that are not placed, or placed or turning such that the vehicle cannot be controlled."""
+        self._check_places()
         rule = self._layout_problem(self.rotor_spins)
         if rule is None:
             return
-        alternating = np.empty(N_ROTORS, int)
-        alternating[np.argsort(np.mod(self.azimuths, math.tau), kind="stable")] = (1, -1, 1, -1)
-        alternating *= alternating[0] * int(self.rotor_spins[0])
+        alternating = self._alternating_spins()
         if self._layout_problem(alternating) is None:
             expected = tuple(alternating.tolist())
             self._refuse("rotor_spins", f"alternating around the airframe, so that yaw is controlled: {expected}")
@@ -225,10 +231,33 @@ class Vehicle:
             self._refuse("rotor_azimuths", rule)
         self._refuse("rotor_positions", rule)
 
+    def _check_places(self) -> None:
+        """Refuse rotors that are placed in two forms or in none, and rotors at the centre of mass."""
+        stated = [name for name in ARMS if getattr(self, name) is not None]
+        if self.rotor_positions is not None and stated:
+            self._refuse("rotor_positions", f"left out where {' and '.join(stated)} is given: one or the other")
+        if self.rotor_azimuths is not None and max(map(abs, self.rotor_azimuths)) > 360.0:
+            self._refuse("rotor_azimuths", "within -360 and 360 deg")
+        if self.rotor_positions is None:
+            length, azimuths = ARMS
+            if self.arm_length is None:
+                self._refuse(length, f"given with {azimuths}, or rotor_positions in place of both")
+            if self.rotor_azimuths is None:
+                self._refuse(azimuths, f"given with {length}, or rotor_positions in place of both")
+        if not self.longest_arm >= FLOORS["m"]:
+            self._refuse("rotor_positions", "away from the centre of mass")
+
+    def _alternating_spins(self) -> Array:
+        """(4,) spins that alternate around the airframe, the first rotor's as it is."""
+        counter_clockwise = np.argsort(np.mod(self.azimuths, math.tau), kind="stable")
+        spins = np.empty(N_ROTORS, int)
+        spins[counter_clockwise] = (1, -1, 1, -1)
+        return np.asarray(spins * spins[0] * int(self.rotor_spins[0]))
+
     def _layout_problem(self, spins: Sequence[float] | Array) -> str | None:
         """Return the missing property of the layout with these spins; None if it is complete."""
         effect = self._effect_of_thrusts(spins)
-        if abs(np.linalg.det(effect)) < 1e-9:
+        if abs(np.linalg.det(effect)) < _SINGULAR:
             return "a layout that controls roll, pitch, yaw and thrust"
         if _hover_shares(effect).min() < LEAST_SHARE:
             return "a layout in which every rotor lifts while the torques cancel, so that it can hover"
@@ -240,28 +269,23 @@ class Vehicle:
         return np.stack([np.ones(N_ROTORS), y, -x, np.array(spins, float)])
 
     def _check_thrust(self) -> None:
+        """Refuse a thrust that is stated in several forms or in none, and a map that cannot be."""
         stated = [name for name in THRUST if getattr(self, name) is not None]
         if not stated:
             self._refuse(THRUST[0], f"given, or {' or '.join(THRUST[1:])} in place of it")
         if len(stated) > 1:
             self._refuse(stated[1], f"left out where {stated[0]} is given: one or the other")
-        name = stated[0]
-        if name == THRUST[0]:
-            return
+        if stated[0] != THRUST[0]:
+            self._check_map(stated[0])
+
+    def _check_map(self, name: str) -> None:
+        """Refuse a map by which thrust is negative, or falls, in the range of its argument, or does not lift."""
         a1, a2 = getattr(self, name)
-        u = "u"
-        low = 0.0
-        top = 1.0
-        unit = ""
-        if self.throttle_offset:
-            u = "v"
-            low = float(self.effective_throttle(np.zeros(1))[0])
-        if name == "thrust_of_speed":
-            u = "w"
-            low = self.speed_min
-            top = self.speed_max
-            unit = " rad/s"
-        if a1 + a2 * low < 0.0 or a1 + 2.0 * a2 * low < 0.0 or a1 + 2.0 * a2 * top <= 0.0:
+        u, low, top, unit = self._map_argument(name)
+        thrust_over_low = a1 + a2 * low
+        slope_at_low = a1 + 2.0 * a2 * low
+        slope_at_top = a1 + 2.0 * a2 * top
+        if thrust_over_low < 0.0 or slope_at_low < 0.0 or slope_at_top <= 0.0:
             rule = f"such that a1 {u} + a2 {u}^2 is not negative and rises from {u} = {low:g} to {top:g}{unit}"
             self._refuse(name, rule)
         largest = a1 * top + a2 * top**2
@@ -270,19 +294,31 @@ class Vehicle:
             rule = f"such that a rotor lifts {carried:.4g} N or more, or it cannot hover: it lifts {largest:.4g} N at"
             self._refuse(name, f"{rule} {u} = {top:g}{unit}")
 
+    def _map_argument(self, name: str) -> tuple[str, float, float, str]:
+        """Return the argument of a map of thrust: its symbol, its least and its largest value, and their unit."""
+        if name == "thrust_of_speed":
+            return "w", self.speed_min, self.speed_max, " rad/s"
+        if self.throttle_offset:
+            without_throttle = float(self.effective_throttle(np.zeros(1))[0])
+            return "v", without_throttle, 1.0, ""
+        return "u", 0.0, 1.0, ""
+
     def _check_hover(self) -> None:
-        weight = self.mass * self.gravity
-        for name, sign, side in (("speed_max", 1.0, "no lower than"), ("speed_min", -1.0, "no higher than")):
-            speed = getattr(self, name)
-            hover = sign * float((sign * self.hover_speeds).max())
-            if sign * (hover - speed) > 0.0:
-                lift = self.level_thrust(speed)
-                rule = (
-                    f"{side} its hover speed, {hover:.6g} rad/s, or it cannot hover (rotors hold {self.speed_min:g} to "
-                    f"{self.speed_max:g} rad/s; {self.mass:g} kg weigh {weight:.4g} N, the rotors lift {lift:.4g} N at "
-                    f"{speed:g} rad/s)"
-                )
-                self._refuse(name, rule)
+        """Refuse rotors that cannot turn at the speeds of hover."""
+        slowest = float(self.hover_speeds.min())
+        fastest = float(self.hover_speeds.max())
+        if fastest > self.speed_max:
+            self._refuse_hover("speed_max", f"no lower than its hover speed, {fastest:.6g} rad/s")
+        if slowest < self.speed_min:
+            self._refuse_hover("speed_min", f"no higher than its hover speed, {slowest:.6g} rad/s")
+
+    def _refuse_hover(self, name: str, rule: str) -> NoReturn:
+        """Refuse a limit of the speeds, and say what the rotors lift at it."""
+        speed = getattr(self, name)
+        held = f"rotors hold {self.speed_min:g} to {self.speed_max:g} rad/s"
+        weight = f"{self.mass:g} kg weigh {self.mass * self.gravity:.4g} N"
+        lift = f"the rotors lift {self.level_thrust(speed):.4g} N at {speed:g} rad/s"
+        self._refuse(name, f"{rule}, or it cannot hover ({held}; {weight}, {lift})")
 
     @property
     def coefficients(self) -> Array:
@@ -303,7 +339,7 @@ class Vehicle:
 
     @property
     def square_law(self) -> tuple[Array, Array]:
-        """(4,) r_i [rad/s] and q_i [-] of the thrust over its coefficient, r w + q w^2; 0 and 1 for b w^2."""
+        """(4,) r_i [rad/s] and (4,) q_i [-] of the thrust f_i = b_i (r_i w + q_i w^2); 0 and 1 where it is b_i w^2."""
         linear, quadratic = self.thrust_law
         return linear / self.coefficients, quadratic / self.coefficients
 
@@ -343,24 +379,29 @@ class Vehicle:
         if self.thrust_of_speed is None:
             return np.sqrt(thrusts / self.coefficients)
         a1, a2 = self.thrust_of_speed
-        root = np.sqrt(np.maximum(a1**2 + 4.0 * a2 * thrusts, 0.0))  # beyond the map's top, its top
-        if a1 > 0.0:
+        # The root of a_1 w + a_2 w^2 = f; beyond the largest thrust of a map with a_2 < 0, that of the largest.
+        root = np.sqrt(np.maximum(a1**2 + 4.0 * a2 * thrusts, 0.0))
+        if a1 > 0.0:  # this form also holds for a_2 = 0, and subtracts no numbers that are nearly equal
             return np.asarray(2.0 * thrusts / (a1 + root))
         return np.asarray((root - a1) / (2.0 * a2))
 
     def level_thrust(self, speed: float) -> float:
         """Return the collective thrust [N], without torque, at which the fastest rotor has a speed [rad/s]."""
-        return float((self.thrusts(np.full(N_ROTORS, speed)) / self.thrust_shares).min())
+        thrusts = self.thrusts(np.full(N_ROTORS, speed))
+        return float((thrusts / self.thrust_shares).min())
 
     @property
     def throttle_share(self) -> float:
-        """Share a of (w / speed_max)^2 = (1 - a) v + a v^2, v of `effective_throttle`; 1 without a map of it: w ~ v."""
+        """Share a of the square in (w / speed_max)^2 = (1 - a) v + a v^2, with v of `effective_throttle`.
+
+        It is 1 without `thrust_of_throttle`: the speed is then proportional to v.
+        """
         if self.thrust_of_throttle is None:
             return 1.0
         return self.thrust_of_throttle[1] / sum(self.thrust_of_throttle)
 
     def effective_throttle(self, throttle: Array) -> Array:
-        """Return v = (u - u_0) / (1 - u_0), at least 0, of throttles u of any shape, with u_0 the `throttle_offset`."""
+        """Return v = (u - u_0) / (1 - u_0) of throttles u of any shape, 0 to 1, with u_0 the `throttle_offset`."""
         offset = self.throttle_offset or 0.0
         return np.clip((throttle - offset) / (1.0 - offset), 0.0, 1.0)
 
@@ -385,7 +426,9 @@ class Vehicle:
 
     def accelerations(self, wrench: Array) -> Array:
         """Return U / m [m/s^2] and J^-1 tau [rad/s^2] (4, ...) of wrenches [U, tau] (4, ...) [N, N m]."""
-        return np.concatenate([wrench[:1] / self.mass, self.angular_acceleration(wrench[1:].T).T])
+        collective = wrench[:1] / self.mass
+        angular = self.angular_acceleration(wrench[1:].T).T
+        return np.concatenate([collective, angular])
 
     def air_moment(self, turning: float, velocity: Array, rates: Array) -> Array:
         """Return the torque (3,) [N m] of `rotor_moment`, `inflow_moment` and `rate_damping`.
@@ -401,7 +444,8 @@ class Vehicle:
         k_x, k_y = self.inflow_moment or (0.0, 0.0)
         v_x, v_y, v_z = velocity
         across = np.array([(m_x * turning - k_x * v_z) * v_y, -(m_y * turning - k_y * v_z) * v_x, 0.0])
-        return np.asarray(across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
+        damping = np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates
+        return np.asarray(across - damping)
 
     def lost_to_inflow(self, speeds: Array, velocity: Array, rates: Array) -> Array:
         """Return what `inflow` takes of the rotors' thrust and of its torques, (4,) [N, N m].
@@ -416,12 +460,13 @@ class Vehicle:
         x, y, _ = self.hubs.T
         axial = velocity[2] + rates[0] * y - rates[1] * x
         lost = (self.inflow or 0.0) * speeds * axial
-        return np.asarray(self.allocation / self.coefficients @ lost)
+        wrench_of_thrusts = self.allocation / self.coefficients
+        return np.asarray(wrench_of_thrusts @ lost)
 
     def air_accelerations(self, velocity: Array, rates: Array) -> Array:
-        """Return what the air adds in hover to U / m [m/s^2] and J^-1 tau [rad/s^2], (4,): arguments of `air_moment`.
+        """Return (4,) what the air adds in hover to U / m [m/s^2] and J^-1 tau [rad/s^2].
 
-        That is by `rotor_moment`, `inflow_moment`, `rate_damping` and `inflow`.
+        That is by `rotor_moment`, `inflow_moment`, `rate_damping` and `inflow`; arguments as of `air_moment`.
         """
         wrench = -self.lost_to_inflow(self.hover_speeds, velocity, rates)
         wrench[1:] += self.air_moment(float(self.hover_speeds.sum()), velocity, rates)
@@ -430,10 +475,14 @@ class Vehicle:
     @property
     def turn_damping(self) -> Array:
         """(3,) torque that opposes each body rate [N m s/rad]: `rate_damping`, and that of `inflow` in hover."""
-        units = np.eye(3)
         still = np.zeros(3)
-        lost = [self.lost_to_inflow(self.hover_speeds, still, unit)[1:] for unit in units]
-        return np.asarray(np.array(self.rate_damping or (0.0, 0.0, 0.0)) + np.diagonal(lost))
+        torques = []
+        for unit_rate in np.eye(3):
+            wrench = self.lost_to_inflow(self.hover_speeds, still, unit_rate)
+            torques.append(wrench[1:])
+        about_its_own_axis = np.diagonal(torques)
+        damping = np.array(self.rate_damping or (0.0, 0.0, 0.0))
+        return np.asarray(damping + about_its_own_axis)
 
     @property
     def turned_by_air(self) -> float:
@@ -498,8 +547,9 @@ class Vehicle:
     @property
     def closest_rotors(self) -> float:
         """Smallest distance between two hubs [m]."""
-        apart = np.linalg.norm(self.hubs[:, None] - self.hubs[None], axis=2)
-        return float(apart[~np.eye(N_ROTORS, dtype=bool)].min())
+        distances = np.linalg.norm(self.hubs[:, None] - self.hubs[None], axis=2)
+        are_two_hubs = ~np.eye(N_ROTORS, dtype=bool)
+        return float(distances[are_two_hubs].min())
 
     @property
     def allocation(self) -> Array:
@@ -529,36 +579,50 @@ def _checked_parameter(name: str, value: Any) -> Any:
     Raises:
         ParameterError: it is not the number, or not the numbers, that it should be.
     """
+    if name == "rotor_positions":
+        return _checked_positions(name, value)
     length = _LENGTHS.get(name)
-    if name == "thrust_coefficient" and isinstance(value, (tuple, list)):
+    if name == "thrust_coefficient" and isinstance(value, (tuple, list)):  # one for each rotor
         length = N_ROTORS
     if length is None:
-        _check_number(name, value, positive=name not in _ANY_SIGN)
+        _check_number(name, value)
         return value
-    if name != "rotor_positions":
-        return _checked_numbers(name, _tuple_of(name, value, length, f"a list of {length} numbers"))
-    rule = f"a list of {length} lists of 3 numbers"
+    return _checked_numbers(name, value, length, f"a list of {length} numbers")
+
+
+def _checked_positions(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
+    """Return one position for each rotor, as tuples."""
+    rule = f"a list of {N_ROTORS} lists of 3 numbers"
+    _check_length(name, value, N_ROTORS, rule)
     positions = []
-    for position in _tuple_of(name, value, length, rule):
-        positions.append(_checked_numbers(name, _tuple_of(name, position, 3, rule)))
+    for position in value:
+        positions.append(_checked_numbers(name, position, 3, rule))
     return tuple(positions)
 
 
-def _tuple_of(name: str, value: Any, length: int, rule: str) -> tuple[Any, ...]:
-    if not isinstance(value, (tuple, list)) or len(value) != length:
-        raise ParameterError("vehicle", name, value, rule)
+def _checked_numbers(name: str, value: Any, length: int, rule: str) -> tuple[float, ...]:
+    """Return a list of numbers as a tuple."""
+    _check_length(name, value, length, rule)
+    for number in value:
+        _check_number(name, number)
     return tuple(value)
 
 
-def _checked_numbers(name: str, numbers: tuple[Any, ...]) -> tuple[Any, ...]:
-    for number in numbers:
-        _check_number(name, number, positive=name not in _ANY_SIGN)
-    return numbers
+def _check_length(name: str, value: Any, length: int, rule: str) -> None:
+    """Refuse what is no list of this length."""
+    if not isinstance(value, (tuple, list)) or len(value) != length:
+        raise ParameterError("vehicle", name, value, rule)
 
 
-def _check_number(name: str, value: object, *, positive: bool) -> None:
-    if isinstance(value, int) and abs(value) > LARGEST:  # it may be too long for a float, or a text
-        value = math.copysign(math.inf, value > 0 or -1)
+def _check_number(name: str, value: object) -> None:
+    """Refuse what is no number, or none that the parameter can have."""
+    positive = name not in _ANY_SIGN
+    if isinstance(value, int) and abs(value) > LARGEST:
+        # It may have too many digits for a float, and for a message, which then shows an infinity.
+        if value > 0:
+            value = math.inf
+        else:
+            value = -math.inf
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise ParameterError("vehicle", name, value, "a finite number")
     if positive and value <= 0.0:
@@ -582,8 +646,7 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
     with _naming(path):
         texts, entries = _read_entries(path)
     for key in overrides or {}:
-        if key not in VEHICLE_UNITS:
-            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, meant=MEANT.get(key, ()))
+        _require_parameter(key)
     stated: dict[str, Any] = dict(texts)
     for key, entry in entries.items():
         stated[key] = entry["value"]
@@ -600,7 +663,10 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
 
 
 def overridden(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters with some replaced; another form of placing the rotors, or of their thrust, is then dropped."""
+    """Return parameters with some replaced.
+
+    Where the overrides place the rotors, or state their thrust, the parameters of any other form of it become None.
+    """
     replaced: list[str] = []
     if "rotor_positions" in overrides:
         replaced += ARMS
@@ -629,7 +695,7 @@ def missing_parameters(values: Mapping[str, Any]) -> list[str]:
         needed |= {*ARMS}
     if not stated & {*THRUST}:
         needed.add(THRUST[0])
-    missing = needed - {*values}
+    missing = needed - {*values}  # a needed one that is None is not missing: `Vehicle` refuses it
     return [name for name in VEHICLE_UNITS if name in missing]
 
 
@@ -659,7 +725,7 @@ def example_notes(path: Path, replaced: Collection[str] = ()) -> tuple[str, ...]
 
     Args:
         path: the vehicle file.
-        replaced: parameters that the file's values are not used of.
+        replaced: names of parameters whose values in the file are not used.
     """
     texts, entries = _read_entries(path)
     left = []
@@ -683,8 +749,11 @@ def vehicle_table(path: Path, name: str) -> dict[str, Any]:
         FileError: as `load_vehicle`.
         ParameterError: it is not a table, or does not say where its numbers are from.
     """
-    table = read_toml(path).get(name, {"source": "none"})
-    if not isinstance(table, dict) or not isinstance(table.get("source"), str) or not table["source"].strip():
+    tables = read_toml(path)
+    if name not in tables:
+        return {}
+    table = tables[name]
+    if not isinstance(table, dict) or not _is_source(table.get("source")):
         raise ParameterError("vehicle", name, table, "a table with a source, a text saying where it is from")
     return {name: value for name, value in table.items() if name != "source"}
 
@@ -701,18 +770,31 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
                 raise ParameterError("vehicle", key, entry, "a text")
             texts[key] = entry
             continue
-        if key not in VEHICLE_UNITS:
-            hint = f"in {path}"
-            meant = MEANT.get(key, ())
-            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, hint=hint, meant=meant)
-        if not isinstance(entry, dict) or set(entry) != {"value", "unit", "source"}:
-            raise ParameterError("vehicle", key, entry, "a table with exactly value, unit and source")
-        if entry["unit"] != VEHICLE_UNITS[key]:
-            raise ParameterError("vehicle", f"{key}.unit", entry["unit"], f"{VEHICLE_UNITS[key]!r}")
-        if not isinstance(entry["source"], str) or not entry["source"].strip():
-            raise ParameterError("vehicle", f"{key}.source", entry["source"], "a text saying where the number is from")
+        _require_parameter(key, hint=f"in {path}")
+        _check_entry(key, entry)
         entries[key] = entry
     return texts, entries
+
+
+def _require_parameter(key: str, hint: str = "") -> None:
+    """Refuse a name that no parameter has; `hint` says where it stands."""
+    if key not in VEHICLE_UNITS:
+        raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, hint=hint, meant=MEANT.get(key, ()))
+
+
+def _check_entry(key: str, entry: object) -> None:
+    """Refuse an entry that is not a value in the parameter's unit, with its source."""
+    if not isinstance(entry, dict) or set(entry) != {"value", "unit", "source"}:
+        raise ParameterError("vehicle", key, entry, "a table with exactly value, unit and source")
+    if entry["unit"] != VEHICLE_UNITS[key]:
+        raise ParameterError("vehicle", f"{key}.unit", entry["unit"], f"{VEHICLE_UNITS[key]!r}")
+    if not _is_source(entry["source"]):
+        raise ParameterError("vehicle", f"{key}.source", entry["source"], "a text saying where the number is from")
+
+
+def _is_source(text: object) -> bool:
+    """Return whether it can say where a number is from: a text that is not blank."""
+    return isinstance(text, str) and bool(text.strip())
 
 
 def _stated_units() -> dict[str, str]:
@@ -742,11 +824,21 @@ _LENGTHS: Final = {
     "inflow_moment": 2,
     "rate_damping": 3,
     "rotor_azimuths": N_ROTORS,
-    "rotor_positions": N_ROTORS,
     "rotor_spins": N_ROTORS,
 }
+"""How many numbers a parameter has that is a list of them; those of `rotor_positions` are lists themselves."""
 _ANY_SIGN: Final = (
-    *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),
-    *("products_of_inertia", "rotor_moment", "inflow_moment", "rate_damping", "inflow"),
-    *("thrust_of_speed", "thrust_of_throttle", "throttle_offset"),
+    "rotor_azimuths",
+    "rotor_positions",
+    "rotor_spins",
+    "speed_min",
+    "products_of_inertia",
+    "rotor_moment",
+    "inflow_moment",
+    "rate_damping",
+    "inflow",
+    "thrust_of_speed",
+    "thrust_of_throttle",
+    "throttle_offset",
 )
+"""Parameters that may be 0 or negative; `Vehicle` restricts some of them further."""

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from quadsim.scenarios.catalogue import Catalogue
     from quadsim.scenarios.schema.scenario import Scenario
     from quadsim.vehicle import Vehicle
-else:
+else:  # cyclopts looks up the annotations of a command; the classes of results are too heavy to import for that
     Catalogue = Flight = Listing = Overlay = Result = Any
 
 
@@ -75,10 +75,10 @@ app: Final = App(
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
     version=_version,
 )
-for _feature, _content in FEATURES.items():
-    for _word, _command in _content.commands.items():
+for _name, _feature in FEATURES.items():
+    for _word, _command in _feature.commands.items():
         app.command(
-            f"quadsim.features.{_feature}.commands:{_command.function}",
+            f"quadsim.features.{_name}.commands:{_command.function}",  # imported when it is called
             name=_word,
             help=_command.help,
             help_epilogue=_examples(*_command.examples),
@@ -166,9 +166,9 @@ def problem(scenario: ScenarioName) -> Problem:
     `model` has A (n, n), B (n, 4), u_bar (4,) [rad/s]; `objective` C_r, Q_y, Q_u; `rows` the constraints, lower <=
     C x + D u + E (u - u_before) <= upper.  `condensed()` and `qp(state, reference, u_before)` give the QP.
 
-    The problem of `robust` has its soft and tightened rows, weights of moves and rotor lag.  It starts where its delay
-    ends, in axes turned by the yaw with `heading`; an estimated disturbance moves its `equilibrium`.  Half-spaces of
-    `controller.avoidance` differ from period to period and are left out.
+    The problem of `robust` has its soft and tightened rows, weights of moves and rotor lag.  Its first state is that at
+    the end of the delay; with `heading`, its axes are turned by the yaw.  An estimated disturbance moves its
+    `equilibrium`.  Half-spaces of `controller.avoidance` differ from period to period and are left out.
 
     Raises:
         InputError: the controller solves no linear MPC problem: `nonlinear`, `lqr`, `pid`, `geometric`, or yours.
@@ -429,7 +429,7 @@ def check(
 
     file = None
     if junit is not None:
-        file = junit_file(junit)
+        file = junit_file(junit)  # refused, if at all, before anything is flown
     if isinstance(target, str | Path) and names_directory(target):
         if changes:
             raise ParameterError("", "--set", changes, "absent when a finished run is checked")
@@ -540,10 +540,8 @@ def compare(
     owner = _owner_of_any(targets)
     products = {"video": video, "recording": recording, "figures": figures}
     for name, is_wanted in products.items():
-        if is_wanted and owner is not None:
-            raise ParameterError("", f"--{name}", True, "absent where campaigns are compared")
-        if is_wanted and page is None:
-            raise ParameterError("", f"--{name}", True, "absent without --out: nothing is written")
+        if is_wanted:
+            _check_product(name, of_campaigns=owner is not None, is_written=page is not None)
     compared: Any
     if owner is not None:
         directories = [Path(str(target)) for target in targets]
@@ -552,7 +550,7 @@ def compare(
         )
     else:
         options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints, "fps": fps}
-        if not markdown:
+        if not markdown:  # Markdown is printed once, at the end
             options["flown"] = flown
         with reporting(progress, "the comparison") as report:
             compared = compare_flights(targets, page, report, overwrite=overwrite, **options)
@@ -561,8 +559,16 @@ def compare(
     return compared
 
 
+def _check_product(name: str, *, of_campaigns: bool, is_written: bool) -> None:
+    """Refuse a product that is asked of a comparison that cannot have it."""
+    if of_campaigns:
+        raise ParameterError("", f"--{name}", True, "absent where campaigns are compared")
+    if not is_written:
+        raise ParameterError("", f"--{name}", True, "absent without --out: nothing is written")
+
+
 def _owner_of_any(targets: Sequence[ComparedName]) -> Any:
-    """Return the commands of the feature that made one of the directories, as `owner_of`; None if none did."""
+    """Return the commands of the feature that made one of the targets; None if none did, as with `owner_of`."""
     for target in targets:
         if isinstance(target, str | Path):
             owner = owner_of(Path(target))
@@ -700,11 +706,12 @@ def film(
         if path.suffix == ".gif":
             render = render_gif
         render = partial(render, flight, workers=workers, fps=fps, progress=report_frames)
-        if path.parent != directory:
-            render(path, overwrite=overwrite)
-        else:  # a product of the run, which its summary lists
-            with adding(directory, products={path.name: "made"}) as folder:
+        is_product_of_run = path.parent == directory
+        if is_product_of_run:
+            with adding(directory, products={path.name: "made"}) as folder:  # its summary then lists the film
                 render(folder / path.name, overwrite=False)
+        else:
+            render(path, overwrite=overwrite)
     return path
 
 
@@ -737,12 +744,11 @@ def view(run: File, /, *, web: Flag = False) -> None:
     from quadsim.report.recording import open_viewer
 
     path = Path(run)
-    if path.is_dir():
-        recording = path / rundir.RECORDING_FILE
-    else:
-        recording = path
     if not path.exists():
         raise FileError(path, "no such run or recording")
+    recording = path
+    if path.is_dir():
+        recording = path / rundir.RECORDING_FILE
     if not recording.is_file():
         raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
     if path.is_dir():

@@ -15,7 +15,7 @@ from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -88,22 +88,34 @@ if TYPE_CHECKING:
     from quadsim.scenarios.schema.controllers import AnyController
     from quadsim.scenarios.schema.scenario import Scenario, VehicleTable
 
-_EFFECT_OF_PARAMETER: Final = {
-    "rotor_rise": ("rotors", "rise", RotorDynamics),
-    "rotor_fall": ("rotors", "fall", RotorDynamics),
-    "rotor_inertia": ("rotors", "inertia", RotorDynamics),
-    "rotor_drag": ("air", "rotor_drag", Air),
-    "inflow": ("air", "inflow", Air),
-    "rotor_moment": ("air", "rotor_moment", Air),
-    "inflow_moment": ("air", "inflow_moment", Air),
-    "rate_damping": ("air", "rate_damping", Air),
-    "body_drag": ("air", "body_drag", Air),
-    "rotor_radius": ("ground", "rotor_radius", None),
-}
-"""Vehicle parameters that act in an effect: its table, the field that also states it, and what switches the effect on.
 
-None: the effect acts only if the scenario has its table.
-"""
+class _EffectField(NamedTuple):
+    """The field of an effect's table that a vehicle parameter fills.
+
+    Attributes:
+        table: of `[effects]`.
+        field: of the table; it may state the parameter itself.
+        table_type: makes the table where `[effects]` lacks it; None: without its table the effect does not act.
+    """
+
+    table: str
+    field: str
+    table_type: type[RotorDynamics | Air] | None
+
+
+_EFFECT_OF_PARAMETER: Final = {
+    "rotor_rise": _EffectField("rotors", "rise", RotorDynamics),
+    "rotor_fall": _EffectField("rotors", "fall", RotorDynamics),
+    "rotor_inertia": _EffectField("rotors", "inertia", RotorDynamics),
+    "rotor_drag": _EffectField("air", "rotor_drag", Air),
+    "inflow": _EffectField("air", "inflow", Air),
+    "rotor_moment": _EffectField("air", "rotor_moment", Air),
+    "inflow_moment": _EffectField("air", "inflow_moment", Air),
+    "rate_damping": _EffectField("air", "rate_damping", Air),
+    "body_drag": _EffectField("air", "body_drag", Air),
+    "rotor_radius": _EffectField("ground", "rotor_radius", None),
+}
+"""The vehicle parameters that act in an effect."""
 _SHARED_PARTS: Final = (
     "vehicle",
     "autopilot",
@@ -119,14 +131,14 @@ _SHARED_PARTS: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Piloted:
-    """A table with an autopilot, so that messages name the field."""
+    """The `[autopilot]` of a vehicle file, parsed within a table so that messages name it: autopilot.rate."""
 
     autopilot: AutopilotSettings
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Disturbed:
-    """A table with a disturbance, for the same."""
+    """The `[disturbance]` of a vehicle file, within a table as `_Piloted`."""
 
     disturbance: Disturbance
 
@@ -164,7 +176,7 @@ class Assembly:
             return self
         other = Assembly(scenario)
         for name in _SHARED_PARTS:
-            if name in vars(self):
+            if name in vars(self):  # a cached part is there once it has been built
                 vars(other)[name] = vars(self)[name]
         return other
 
@@ -174,7 +186,7 @@ class Assembly:
         return self.of(self._with_derived_values(self.scenario))
 
     def _with_derived_values(self, scenario: Scenario) -> Scenario:
-        """Return a scenario, this one or `recording`, with every derived value stated."""
+        """Return a scenario with every derived value stated; it is that of this assembly, or its `recording`."""
         controller, events = self._controllers_with_solver()
         vehicle, autopilot = self._whole_tables
         fields = {"vehicle": vehicle, "autopilot": autopilot, "effects": self.effects}
@@ -182,7 +194,7 @@ class Assembly:
 
     @property
     def recorded(self) -> Assembly:
-        """The assembly of `recording`."""
+        """The assembly of the scenario with the numbers of its vehicle's file, `recording`."""
         return self.of(self.recording)
 
     @property
@@ -208,10 +220,11 @@ class Assembly:
         if scenario is None:
             scenario = self.scenario
         resolved = self._with_derived_values(scenario)
-        return scenario.written(resolved.altered(events=scenario.events))
+        with_stated_events = resolved.altered(events=scenario.events)  # a file keeps its events as they are
+        return scenario.written(with_stated_events)
 
     def audited(self) -> Assembly:
-        """Return the assembly with the bounds of a user's controller, which builds it, as constraints."""
+        """Return the assembly with the bounds of a user's controller as constraints; it builds that controller."""
         if not isinstance(self.scenario.controller, Plugin):
             return self
         return self.with_user_bounds(self.controller())
@@ -220,7 +233,10 @@ class Assembly:
 
     @cached_property
     def vehicle(self) -> Vehicle:
-        """The modelled vehicle: its file with the scenario's overrides; a resolved scenario needs no file."""
+        """The modelled vehicle: its file with the scenario's numbers in place of the file's.
+
+        A resolved or recorded scenario has every number, and needs no file.
+        """
         file = self.scenario.vehicle.file
         overrides = self._overrides
         try:
@@ -233,7 +249,7 @@ class Assembly:
 
     @property
     def _overrides(self) -> dict[str, Any]:
-        """The numbers of `[vehicle]`: those recorded from its file, under those stated."""
+        """The numbers of `[vehicle]`: those recorded from its file, replaced by those stated."""
         numbers = self.scenario.vehicle.overrides()
         recorded = self.scenario.recorded
         if recorded is None:
@@ -246,7 +262,7 @@ class Assembly:
             else:
                 repeated[name] = value
         together = overridden(repeated, stated)
-        return {name: value for name, value in together.items() if value is not None}
+        return {name: value for name, value in together.items() if value is not None}  # None: replaced in another form
 
     @cached_property
     def autopilot(self) -> AutopilotSettings | None:
@@ -272,11 +288,12 @@ class Assembly:
             ParameterError: the vehicle is impossible.
         """
         modelled = self.vehicle
-        if "throttle_offset" in self._actual_parameters:
+        parameters = self._actual_parameters
+        if "throttle_offset" in parameters:
             rule = "absent: the plant takes rotor speeds, only logs have a throttle"
-            raise ParameterError("actual", "throttle_offset", self._actual_parameters["throttle_offset"], rule)
+            raise ParameterError("actual", "throttle_offset", parameters["throttle_offset"], rule)
         try:
-            return altered(modelled, self._actual_parameters)
+            return altered(modelled, parameters)
         except ParameterError as error:
             raise ParameterError("actual", error.name, error.value, error.rule) from None
 
@@ -302,15 +319,16 @@ class Assembly:
         for name, size in self._actual_parameters.items():
             if name not in _EFFECT_OF_PARAMETER:
                 continue
-            table, field, make_default = _EFFECT_OF_PARAMETER[name]
+            table, field, table_type = _EFFECT_OF_PARAMETER[name]
             settings = getattr(effects, table)
-            if settings is None and make_default is not None:
-                settings = make_default()
+            if settings is None and table_type is not None:
+                settings = table_type()
             if settings is None:
                 continue
-            stated = getattr(settings, field)
-            if stated not in (None, size):
-                raise ParameterError("actual", name, size, f"absent where effects.{table}.{field} = {stated} states it")
+            size_of_effect = getattr(settings, field)
+            if size_of_effect is not None and size_of_effect != size:
+                rule = f"absent where effects.{table}.{field} = {size_of_effect} states it"
+                raise ParameterError("actual", name, size, rule)
             acting[table] = settings
         return replace(effects, **acting).resolved(self.actual)
 
@@ -318,6 +336,7 @@ class Assembly:
         """Return (12,) the state at t = 0, that of the reference motion if the scenario starts on it."""
         initial = self.scenario.initial
         if initial.on_reference and motion is not None:
+            # A row as `physics_to_state` takes it: time, position, quaternion, velocity, body rates.
             physics = np.array(
                 [0.0, *motion.position[0], *motion.attitude[0], *motion.velocity[0], *motion.body_rates[0]]
             )
@@ -365,7 +384,7 @@ class Assembly:
 
     @property
     def course_cut(self) -> float | None:
-        """Time [s] at which the course ends, if the flight is over before; else None.
+        """End of the course [s] where the flight is over before it; else None.
 
         Courses without an end are never cut, nor is a function of time, which is sampled for the flight.
         """
@@ -406,11 +425,13 @@ class Assembly:
         velocity, acceleration = course.derivatives(t)
         poses = course.sample(t)
         position = poses[:, :3]
-        yaw: Array | float = np.full(len(t), course.initial[3])
+        yaw: Array | float
         if course.stated_heading:
             yaw = poses[:, 3]
         elif course.free_heading:
-            yaw = float(course.initial[3])
+            yaw = float(course.initial[3])  # where it starts
+        else:
+            yaw = np.full(len(t), course.initial[3])  # held
         return motion_along(position, velocity, acceleration, period=period, vehicle=self.vehicle, yaw=yaw)
 
     @cached_property
@@ -428,10 +449,10 @@ class Assembly:
             return self.scenario.regions
         reference = self.reference(self.scenario.periods + 1)[:, :3]
         t = self.scenario.control_period * np.arange(len(reference), dtype=np.float64)
-        timed = [corridor.timed(t, reference) for corridor in corridors]
-        if self.scenario.keep_in is None:
-            return tuple(timed)
-        return (*timed, self.scenario.keep_in)
+        regions: list[Corridor | Fence] = [corridor.timed(t, reference) for corridor in corridors]
+        if self.scenario.keep_in is not None:
+            regions.append(self.scenario.keep_in)
+        return tuple(regions)
 
     @property
     def course_steps(self) -> tuple[CourseStep, ...]:
@@ -459,28 +480,40 @@ class Assembly:
         """
         if spec is None:
             spec = self.scenario.controller
-        if spec.commands != ROTORS and spec.inner_lag is None and is_dataclass(spec):
-            spec = replace(spec, inner_lag=self.inner_lag)
-        if spec.turns_by_attitude and spec.attitude_lag is None and is_dataclass(spec):
-            spec = replace(spec, attitude_lag=self.attitude_lag)
+        spec = self._with_lags(spec)
         shapes = (*self.scenario.obstacles, *self.regions)
         pilot = build(spec, self.vehicle, self.scenario.control_period, shapes)
         check_measured(self.scenario.computation, pilot)
         return self.with_autopilot(pilot)
 
+    def _with_lags(self, spec: AnyController) -> AnyController:
+        """Return a controller's table with the lags of the autopilot that flies its commands, where it states none."""
+        lags = {}
+        if spec.commands != ROTORS and spec.inner_lag is None:
+            lags["inner_lag"] = self.inner_lag
+        if spec.turns_by_attitude and spec.attitude_lag is None:
+            lags["attitude_lag"] = self.attitude_lag
+        if lags and is_dataclass(spec):
+            return replace(spec, **lags)
+        return spec
+
     def _controllers_with_solver(self) -> tuple[AnyController, tuple[Event, ...]]:
-        """Return controller and events with the `solver` of each controller stated, to fly as without."""
+        """Return controller and events with the `solver` of each controller stated, to fly as without.
+
+        An event that changes only some fields inherits the solver that is now stated before it.  Where its controller
+        would choose another one, the event has to state that.
+        """
         controller = self._with_solver(self.scenario.controller)
-        solver_before = _solver_of(controller)
-        changed: dict[int, Event] = {}
+        inherited = _solver_of(controller)
+        stating_solver: dict[int, Event] = {}  # by the identity of the event that they replace
         ordered = sorted(events_of(self.scenario.events, ControllerEvent), key=attrgetter("at"))
         for event, (_, spec) in zip(ordered, self.scenario.controller_changes, strict=True):
             solver = _solver_of(self._with_solver(spec))
-            is_whole_table = "type" in event.fields  # which states itself as the first does
-            if not is_whole_table and "solver" not in event.fields and solver != solver_before:
-                changed[id(event)] = replace(event, fields={**event.fields, "solver": solver})
-            solver_before = solver
-        events = tuple(changed.get(id(event), event) for event in self.scenario.events)
+            inherits = "type" not in event.fields and "solver" not in event.fields
+            if inherits and solver != inherited:
+                stating_solver[id(event)] = replace(event, fields={**event.fields, "solver": solver})
+            inherited = solver
+        events = tuple(stating_solver.get(id(event), event) for event in self.scenario.events)
         return controller, events
 
     def _with_solver(self, spec: AnyController) -> AnyController:
@@ -509,29 +542,34 @@ class Assembly:
     def attitude_lag(self) -> tuple[float, ...]:
         """(3,) lags of roll, pitch and yaw behind a commanded attitude [s], by a step on the autopilot."""
         timestep = self.scenario.plant.timestep
-        rate_lags = tuple(self.scenario.controller.inner_lag or self.inner_lag)
+        _, *rate_lags = self.scenario.controller.inner_lag or self.inner_lag
         if self.user_autopilot is not None:
             with self._calling_autopilot():
-                return identify_attitude_lags(self.vehicle, self.user_autopilot, rate_lags[1:], timestep=timestep)
+                return identify_attitude_lags(self.vehicle, self.user_autopilot, tuple(rate_lags), timestep=timestep)
         settings = self.autopilot or AutopilotSettings()
-        return built_in_attitude_lags(self.vehicle, settings, rate_lags[1:], timestep)
+        return built_in_attitude_lags(self.vehicle, settings, tuple(rate_lags), timestep)
 
     def _calling_autopilot(self) -> AbstractContextManager[None]:
-        what = f"autopilot: {type(self.user_autopilot).__name__} cannot be used"
-        return user_code(lambda error: InputError(f"{what}: {reason_of(error)}"), passing=(QuadsimError,))
+        """Turn whatever an autopilot that was passed in raises into an `InputError` that names it."""
+
+        def error_of(error: BaseException) -> InputError:
+            name = type(self.user_autopilot).__name__
+            return InputError(f"autopilot: {name} cannot be used: {reason_of(error)}")
+
+        return user_code(error_of, passing=(QuadsimError,))
 
     @property
     def autopilot_flown(self) -> dict[str, Any]:
         """What flew the targets: the class of an autopilot passed in, or `built-in`, and the lags that the law knew."""
-        if self.user_autopilot is None:
-            name = "built-in"
-        else:
-            name = type(self.user_autopilot).__name__
-        lag = self.scenario.controller.inner_lag or vars(self).get("inner_lag")
-        flown: dict[str, Any] = {"name": name}
-        if lag is not None:
-            flown["inner_lag"] = [*lag]
-        attitude_lag = self.scenario.controller.attitude_lag or vars(self).get("attitude_lag")
+        flown: dict[str, Any] = {"name": "built-in"}
+        if self.user_autopilot is not None:
+            flown["name"] = type(self.user_autopilot).__name__
+        controller = self.scenario.controller
+        built = vars(self)  # has a lag once a controller has been built with it
+        inner_lag = controller.inner_lag or built.get("inner_lag")
+        if inner_lag is not None:
+            flown["inner_lag"] = [*inner_lag]
+        attitude_lag = controller.attitude_lag or built.get("attitude_lag")
         if attitude_lag is not None:
             flown["attitude_lag"] = [*attitude_lag]
         return flown
@@ -553,7 +591,7 @@ class Assembly:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """The controller's bounds on signals of the audit, in file units; of those on speeds, what the rotors can do.
+        """The controller's bounds on signals of the audit, in file units; those on speeds within the rotors' range.
 
         See `quadsim.mpc.tables.controller.ControllerTable.audited`.  Audit, notes and feasibility all take these.
         """
@@ -566,7 +604,7 @@ class Assembly:
 
     @property
     def space_limits(self) -> tuple[SpaceLimit, ...]:
-        """Those of obstacles and regions alone."""
+        """The limits of the audit by obstacles and regions alone."""
         scenario = self.scenario
         regions = self.regions
         if not scenario.obstacles and not regions:
@@ -599,12 +637,13 @@ class Assembly:
         if settings is None and not stalls:
             return None
         has_fallback = spec.fallback is not None and spec.fallback.enabled
-        stated = filled(settings or ComputationTime(), plan=has_fallback and not spec.turns_by_attitude)
-        if stated.plan and spec.turns_by_attitude:
+        continues_plan = has_fallback and not spec.turns_by_attitude  # where the settings do not say
+        settings = filled(settings or ComputationTime(), plan=continues_plan)
+        if settings.plan and spec.turns_by_attitude:
             rule = f'false where controller.commands = "{ATTITUDE}": a plan has body rates, not later attitudes'
             raise ParameterError("computation", "plan", True, rule)
-        per_iteration = times_by_solver(stated.per_iteration)
-        return Computation(**vars(replace(stated, per_iteration=per_iteration)), stalls=stalls)
+        settings = replace(settings, per_iteration=times_by_solver(settings.per_iteration))
+        return Computation(**vars(settings), stalls=stalls)
 
     # --- plant -------------------------------------------------------------------------------------------------------
 
@@ -621,12 +660,12 @@ class Assembly:
         scenario = self.scenario
         if forces is None:
             forces = self._forces()
-        states_speed_limits = "speed_min" in self._actual_parameters or "speed_max" in self._actual_parameters
+        has_actual_limits = "speed_min" in self._actual_parameters or "speed_max" in self._actual_parameters
         return Plant(
             self.actual,
             timestep=scenario.plant.timestep,
             integrator=scenario.plant.integrator,
-            limit_speeds=scenario.plant.limit_speeds or states_speed_limits,
+            limit_speeds=scenario.plant.limit_speeds or has_actual_limits,
             effects=self.effects,
             changes=self.changes(),
             wind=self.wind(),
@@ -665,8 +704,9 @@ class Assembly:
             ParameterError: there is wind, but nothing for it to push.
         """
         air = self.effects.air or Air()
-        blown = any(isinstance(event, Gust | WindChange) for event in self.scenario.events)
-        if not (any(air.wind) or air.turbulence is not None or blown):
+        gusts, changes = self.winds
+        moves = any(air.wind) or air.turbulence is not None or gusts or changes
+        if not moves:
             return None
         air.require_drag(self.vehicle)
         return air
@@ -702,7 +742,7 @@ class Assembly:
             events = self.scenario.events
         rotors = self.effects.rotors or RotorDynamics()
         for event in events_of(events, LagChange):
-            rotors.lagging(event)
+            rotors.lagging(event)  # built only to be checked
         losses = events_of(events, RotorLoss)
         pushes = events_of(events, Push)
         of_plant = [event for event in events if isinstance(event, Change)]

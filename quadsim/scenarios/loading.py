@@ -53,45 +53,62 @@ def assemble(
     Raises:
         InputError: the file is missing or malformed, a field is invalid, or a part that it names cannot be flown.
     """
-    is_file = isinstance(source, str | Path)
-    by_path: dict[Any, Any] = {}
-    settings: list[str] = []
-    if isinstance(changes, Mapping):
-        by_path |= changes
-    else:
-        settings += changes
-    if settings and not is_file:
-        raise InputError("changes of a Scenario are a mapping: {'controller.horizon': 30}")
-    if seed is not None:
-        if isinstance(changes, Mapping) or not is_file:
-            by_path["seed"] = seed
-        else:
-            settings.append(f"seed={seed}")
-    if isinstance(source, str | Path) and Path(source).is_dir() and str(source) not in scenario_names():
-        raise InputError(f"{source} is a directory; give a scenario's name or its TOML file")
     try:
         if isinstance(source, str | Path):
-            scenario = _read(str(source), settings)
+            scenario = _load(str(source), changes, seed)
         else:
-            scenario = source
-        if by_path:
-            scenario = scenario.replace(by_path)
+            scenario = _change(source, changes, seed)
         return checked(Assembly(scenario))
-    except OSError as error:  # of looking whether a file is there, e.g. under a name longer than the system takes
+    except OSError as error:  # even a look for a file can fail, e.g. by a name longer than the system takes
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
+
+
+def _load(name: str, changes: Mapping[str, Any] | Sequence[str], seed: int | None) -> Scenario:
+    """Return the scenario of a name or file, changed: by texts in its tables, or by path once parsed.
+
+    Raises:
+        InputError: as `assemble`.
+    """
+    if Path(name).is_dir() and name not in scenario_names():
+        raise InputError(f"{name} is a directory; give a scenario's name or its TOML file")
+    if isinstance(changes, Mapping):
+        return _change(_read(name, ()), changes, seed)
+    settings = [*changes]
+    if seed is not None:
+        settings.append(f"seed={seed}")
+    return _read(name, settings)
+
+
+def _change(scenario: Scenario, changes: Mapping[str, Any] | Sequence[str], seed: int | None) -> Scenario:
+    """Return a scenario with other values by dotted path, and another seed where one is given.
+
+    Raises:
+        InputError: the changes are texts, or a value is not allowed.
+    """
+    by_path: dict[Any, Any] = {}
+    if isinstance(changes, Mapping):
+        by_path |= changes
+    elif changes:
+        raise InputError("changes of a Scenario are a mapping: {'controller.horizon': 30}")
+    if seed is not None:
+        by_path["seed"] = seed
+    if not by_path:
+        return scenario
+    return scenario.replace(by_path)
 
 
 def _read(name: str, settings: Sequence[str]) -> Scenario:
     """Return the scenario of a name or file, with `dotted.path=value` texts applied to its tables."""
-    data = read_scenario(name)
-    file, changes = scenario_source(name)
-    label = source_label((file, changes))
-    unchanged = copy.deepcopy(data)
-    apply_settings(data, settings, file.parent)
+    tables = read_scenario(name)
+    source = scenario_source(name)
+    file, _ = source
+    label = source_label(source)
+    tables_before = copy.deepcopy(tables)
+    apply_settings(tables, settings, file.parent)
     try:
-        return parse_scenario(data, source=label, directory=file.parent)
+        return parse_scenario(tables, source=label, directory=file.parent)
     except ScenarioError as error:
-        causes = _explain_types(error.problems, name, unchanged, data)
+        causes = _explain_types(error.problems, name, tables_before, tables)
         raise ScenarioError(label, [*error.problems, *causes]) from None
 
 
@@ -103,35 +120,44 @@ def apply_settings(data: dict[str, Any], settings: Sequence[str], directory: Pat
     """
     defaults = None
     if settings:
-        with contextlib.suppress(InputError, OSError):  # a file may be complete with its settings alone
+        # Before its settings, a file may lack fields; it then has no defaults yet.
+        with contextlib.suppress(InputError, OSError):
             defaults = plain(parse_scenario(data, directory=directory))
     for setting in settings:
         apply_setting(data, setting, defaults)
 
 
 def _explain_types(
-    problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]
+    problems: Sequence[str], name: str, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Explain why a table lacks fields or has too many: its type differs from that in the file."""
+    """Explain why a table lacks fields or has unknown ones: its type is not that for which the rest of it was written.
+
+    Args:
+        problems: what is wrong with the tables after their settings.
+        name: of the scenario, or its file.
+        before: the tables before their settings.
+        after: the tables after them.
+    """
     lacking = set()
-    exceeding = set()
+    with_unknown = set()
     for problem in problems:
         table = problem.partition(".")[0]
         if problem.endswith(" is missing"):
             lacking.add(table)
         elif " is not a field of " in problem:
-            exceeding.add(table)
-    types_before = retyped(read, data)
-    for table, before in types_before.items():
-        if table in lacking | exceeding:
-            changed = f"--set changed its type from {before!r} to {data[table]['type']!r}, and all other fields stayed"
-            base = Path(name).name
-            yield f'{table}: {changed}; a file with base = "{base}" and a whole [{table}] replaces them'
+            with_unknown.add(table)
+    types_before = retyped(before, after)
+    for table, type_before in types_before.items():
+        if table in lacking or table in with_unknown:
+            type_now = after[table]["type"]
+            cause = f"--set changed its type from {type_before!r} to {type_now!r}, and all other fields stayed"
+            advice = f'a file with base = "{Path(name).name}" and a whole [{table}] replaces them'
+            yield f"{table}: {cause}; {advice}"
     file, _ = scenario_source(name)
-    for table, before in replaced_tables(file).items():
+    for table, base_type in replaced_tables(file).items():
         if table in lacking and table not in types_before:
-            other = f"of another type than that of its base ({before})"
-            yield f"{table}: {other}, it replaces it whole and inherits nothing"
+            cause = f"of another type than that of its base ({base_type})"
+            yield f"{table}: {cause}, it replaces it whole and inherits nothing"
 
 
 class ScenarioFile(Document):
@@ -143,7 +169,7 @@ class ScenarioFile(Document):
         return Assembly(parse_scenario(tomllib.loads(self.content))).recorded.scenario
 
     def to_json(self) -> Any:
-        """Return its tables."""
+        """Return the data that it was given, or else the tables of its text."""
         if self.data is None:
             return tomllib.loads(self.content)
         return self.data

@@ -37,17 +37,19 @@ def checked(assembly: Assembly) -> Assembly:
     _check_rotor_speeds(assembly)
     ground = assembly.scenario.effects.ground
     if ground is not None and (ground.contact or ground.effect):
-        _check_floor(assembly)
+        _check_start_above_floor(assembly)
+    if ground is not None and ground.contact:
+        _check_start_into_floor(assembly)
     _check_space(assembly)
     return assembly
 
 
 def _check_effects(assembly: Assembly) -> None:
-    """Reject effects that are impossible with the vehicle, or with the integrator."""
+    """Reject a vehicle that cannot hover, and effects that are impossible with it or with the integrator."""
     scenario = assembly.scenario
     load = assembly.effects.load or Load()
-    mass_properties(assembly.actual, load, load.payloads)
-    _ = assembly.moving_air
+    mass_properties(assembly.actual, load, load.payloads)  # refuses what is no rigid body
+    _ = assembly.moving_air  # refuses wind that has nothing to push
     changes = assembly.changes()
     if scenario.plant.integrator == "rk4":
         check_free(assembly.effects, changes, scenario.obstacles)
@@ -63,7 +65,7 @@ def _check_course(assembly: Assembly) -> None:
 
 
 def _check_rotor_speeds(assembly: Assembly) -> None:
-    """Reject a start with rotors beyond their range, and a vehicle that cannot hover."""
+    """Reject a start with rotors beyond their range."""
     speeds = assembly.initial_speeds
     fastest = assembly.actual.speed_max
     if assembly.scenario.initial.rotor_speeds is not None and speeds.max() > fastest:
@@ -71,8 +73,8 @@ def _check_rotor_speeds(assembly: Assembly) -> None:
         raise ParameterError("initial", "rotor_speeds", speeds.tolist(), rule)
 
 
-def _check_floor(assembly: Assembly) -> None:
-    """Reject a start below the floor or into it, or one in the air with rotors at rest."""
+def _check_start_above_floor(assembly: Assembly) -> None:
+    """Reject a start below the floor, or one in the air with rotors at rest."""
     initial = assembly.scenario.initial
     position = list(initial.position)
     shape = outline(assembly.actual)
@@ -87,9 +89,15 @@ def _check_floor(assembly: Assembly) -> None:
     if initial.cold and feet > AIRBORNE:
         rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
         raise ParameterError("initial", "position", position, rule)
-    ground = assembly.scenario.effects.ground
+
+
+def _check_start_into_floor(assembly: Assembly) -> None:
+    """Reject a start on the floor at which a part moves into it."""
+    initial = assembly.scenario.initial
+    shape = outline(assembly.actual)
+    state = assembly.initial_state()[None, :]
     sinking = -touching_speed(state, np.radians(initial.body_rates), shape)
-    if sinking > _ROUNDING_SPEED and ground is not None and ground.contact:
+    if sinking > _ROUNDING_SPEED:
         if initial.velocity[2] < 0.0:
             name = "velocity"
         else:
@@ -103,13 +111,15 @@ def _check_space(assembly: Assembly) -> None:
     limits = assembly.space_limits
     if not limits:
         return
+    t = np.zeros(1)
     start = assembly.initial_state(assembly.motion)[None, list(POSITION)]
     for limit in limits:
-        clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
-        if limit.start <= 0.0 and limit.violated(clear):
+        if limit.start > 0.0:
+            continue
+        clear = float(limit.shape.clearance(t, start)[0]) - limit.radius
+        if limit.violated(clear):
+            side = "clear of"
             if isinstance(limit.shape, Region):
                 side = "inside"
-            else:
-                side = "clear of"
             ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
             raise ParameterError("initial", "position", start[0].tolist(), f"{side} {limit.name}, by {ball}")

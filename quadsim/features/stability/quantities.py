@@ -41,7 +41,6 @@ class VariedQuantity:
 
     Attributes:
         name: the word after `--over`.
-        title: what is varied.
         unit: of its values; `x` is a factor of the nominal.
         nominal: its value in a scenario.
         ends: the range that is searched, given the nominal value.
@@ -52,7 +51,6 @@ class VariedQuantity:
     """
 
     name: str
-    title: str
     unit: str
     nominal: Callable[[Assembly], float]
     ends: Callable[[float], tuple[float, float]]
@@ -224,7 +222,6 @@ def _about(most: float) -> Callable[[float], tuple[float, float]]:
 _ALL: Final = (
     VariedQuantity(
         name=HEADING,
-        title="heading of the hover",
         unit="deg",
         nominal=_usual_heading,
         ends=_about(MOST_TURN),
@@ -232,7 +229,6 @@ _ALL: Final = (
     ),
     VariedQuantity(
         name="delay",
-        title="time from measurement to command, computation.delay",
         unit="ms",
         nominal=_delay,
         ends=_from_zero(MOST_MILLISECONDS),
@@ -241,7 +237,6 @@ _ALL: Final = (
     ),
     VariedQuantity(
         name="lag",
-        title="time constant of the rotors, effects.rotors.rise and fall",
         unit="ms",
         nominal=_lag,
         ends=_lags,
@@ -249,7 +244,6 @@ _ALL: Final = (
     ),
     VariedQuantity(
         name="mass",
-        title="mass of the actual vehicle, over the nominal",
         unit="x",
         nominal=_one,
         ends=_factors,
@@ -258,8 +252,7 @@ _ALL: Final = (
         measure="nominal",
     ),
     VariedQuantity(
-        name="thrust",
-        title="thrust, and torque, of the actual rotors at a speed, over the nominal: the gain of the loop",
+        name="thrust",  # thrust and torque of the actual rotors at a speed: the gain of the loop
         unit="x",
         nominal=_one,
         ends=_factors,
@@ -269,7 +262,6 @@ _ALL: Final = (
     ),
     VariedQuantity(
         name="inertia",
-        title="inertia of the actual vehicle, over the nominal",
         unit="x",
         nominal=_one,
         ends=_factors,
@@ -278,8 +270,7 @@ _ALL: Final = (
         measure="nominal",
     ),
     VariedQuantity(
-        name="period",
-        title="control period, for which the controller is built anew",
+        name="period",  # for which the controller is built anew
         unit="ms",
         nominal=lambda assembly: 1e3 * assembly.scenario.control_period,
         ends=_factors,
@@ -289,16 +280,14 @@ _ALL: Final = (
         measure="nominal",
     ),
     VariedQuantity(
-        name="drag",
-        title="linear drag of the body over its mass, besides what the scenario states",
+        name="drag",  # linear drag of the body over its mass, in addition to the scenario's
         unit="1/s",
         nominal=_zero,
         ends=_from_zero(MOST_DRAG),
         fields=_set_drag,
     ),
     VariedQuantity(
-        name="tilt",
-        title="tilt that is held against a steady side force along x",
+        name="tilt",  # held against a steady side force along x
         unit="deg",
         nominal=_zero,
         ends=_about(MOST_TILT),

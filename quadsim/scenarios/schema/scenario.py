@@ -71,6 +71,7 @@ class _Modelled(_Overrides):
     file: Annotated[str, doc("a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")]
 
 
+# `Vehicle` alone declares the parameters; both tables take them from it.  A type checker sees the bases.
 if TYPE_CHECKING:
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
@@ -132,7 +133,7 @@ class Lost:
 
     @property
     def limits(self) -> dict[str, float]:
-        """The criteria that are on and end a flight; see `quadsim.flight.phase`."""
+        """The criteria that are on and end a flight early, all but `departure`; see `quadsim.flight.phase`."""
         limits = {}
         for name in CRITERIA:
             limit = getattr(self, name)
@@ -238,16 +239,24 @@ class Scenario:
         ),
     ] = ()
 
+    # In `vars`, beside the fields: `stated`, the tables that the scenario was parsed from; `restated`, the names of the
+    # fields that `altered` has replaced since; `ends_with_course`, whether the duration comes from the course.
+
     def __post_init__(self) -> None:
         if math.isinf(self.duration):
-            until: float | None = getattr(self.reference, "until", None)
-            if until is None:
-                raise ValueError("duration is missing")
-            periods = math.ceil(until / self.control_period - 1e-6)
-            vars(self).update(duration=round(periods * self.control_period, 9), ends_with_course=True)
-            if self.duration > LONGEST_FLIGHT:
-                raise ValueError(f"duration must be <= {LONGEST_FLIGHT}; the course takes {self.duration}")
+            self._derive_duration()
         self.require_consistent()
+
+    def _derive_duration(self) -> None:
+        """Set the duration to the whole control periods in which the course ends."""
+        until: float | None = getattr(self.reference, "until", None)
+        if until is None:
+            raise ValueError("duration is missing")
+        periods = math.ceil(until / self.control_period - 1e-6)  # an excess by rounding makes no period
+        duration = round(periods * self.control_period, 9)
+        if duration > LONGEST_FLIGHT:
+            raise ValueError(f"duration must be <= {LONGEST_FLIGHT}; the course takes {duration}")
+        vars(self).update(duration=duration, ends_with_course=True)
 
     def __repr__(self) -> str:
         parts = f"{self.duration:g} s of {self.vehicle.file}, {self.reference.type} by {self.controller.type}"
@@ -309,14 +318,18 @@ class Scenario:
     def recording(self, vehicle: VehicleTable, autopilot: AutopilotSettings | None) -> Scenario:
         """Return the scenario with these tables, in which it repeats the numbers of its vehicle's file."""
         record = self.recorded
-        if record is None:
-            stated = []
-            for table in REPEATING:
-                for name in plain(getattr(self, table) or {}):
-                    if name != "file":
-                        stated.append(f"{table}.{name}")
-            record = RecordedVehicle(file=self.vehicle.file, stated=tuple(stated))
+        if record is None:  # what the tables have so far is the scenario's own
+            record = RecordedVehicle(file=self.vehicle.file, stated=tuple(self._numbers_of_vehicle()))
         return self.altered(vehicle=vehicle, autopilot=autopilot, recorded=record)
+
+    def _numbers_of_vehicle(self) -> list[str]:
+        """Return the paths of the fields of `[vehicle]` and `[autopilot]` that have a value, as vehicle.mass."""
+        paths = []
+        for table in REPEATING:
+            for name in plain(getattr(self, table) or {}):
+                if name != "file":
+                    paths.append(f"{table}.{name}")
+        return paths
 
     def require_consistent(self) -> None:
         """Refuse fields that are valid alone but inconsistent.
@@ -327,10 +340,14 @@ class Scenario:
         self._check_periods()
         self._check_recorded()
         self._check_events()
-        controllers = [self.controller, *(spec for _, spec in self.controller_changes)]
+        controllers = [self.controller]
+        for _, controller in self.controller_changes:
+            controllers.append(controller)
         self._check_inner_rates(controllers)
         self._check_size(controllers)
-        if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
+        ground = self.effects.ground
+        has_floor = ground is not None and ground.contact
+        if self.initial.cold and not has_floor:
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
         self._check_constraints()
@@ -367,21 +384,22 @@ class Scenario:
 
     def _check_inner_rates(self, controllers: Sequence[AnyController]) -> None:
         """Refuse inner loops whose period is no whole number of physics steps."""
-        for spec in controllers:
-            if spec.indi is not None:
-                try:
-                    inner_steps(spec.indi.rate, self.plant.timestep)
-                except ParameterError as error:
-                    raise ValueError(f"controller.indi.rate must be {error.rule}; got {spec.indi.rate}") from None
+        for controller in controllers:
+            if controller.indi is not None:
+                self._check_inner_rate("controller.indi.rate", controller.indi.rate)
         if self.autopilot is not None and self.autopilot.rate is not None:
-            try:
-                inner_steps(self.autopilot.rate, self.plant.timestep)
-            except ParameterError as error:
-                raise ValueError(f"autopilot.rate must be {error.rule}; got {self.autopilot.rate}") from None
+            self._check_inner_rate("autopilot.rate", self.autopilot.rate)
+
+    def _check_inner_rate(self, field: str, rate: float) -> None:
+        """Refuse a rate [Hz] whose period is no whole number of physics steps."""
+        try:
+            inner_steps(rate, self.plant.timestep)
+        except ParameterError as error:
+            raise ValueError(f"{field} must be {error.rule}; got {rate}") from None
 
     def _check_size(self, controllers: Sequence[AnyController]) -> None:
         """Refuse a flight of too many steps, of the physics or of all plans together."""
-        longest_horizon = max(spec.horizon for spec in controllers)
+        longest_horizon = max(controller.horizon for controller in controllers)
         counts = {
             "physics steps": self.periods * self.steps_per_period,
             "planned steps": self.periods * longest_horizon,
@@ -413,17 +431,18 @@ class Scenario:
         names = [constraint.name for constraint in self.constraints]
         for polytope in self.polytopes:
             names += polytope.row_names
-        for solid in (*self.obstacles, *self.regions):
-            names.append(solid.name)
+        for shape in (*self.obstacles, *self.regions):
+            names.append(shape.name)
         return names
 
     def _check_events(self) -> None:
-        """Refuse, in order of time, events that the flight as it is by then cannot have."""
+        """Refuse events that do not fit the flight as the events before them leave it."""
         carried = 0
         if self.effects.load is not None:
             carried = len(self.effects.load.payloads)
         controller = self.controller
-        for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
+        in_order_of_time = sorted(enumerate(self.events), key=lambda numbered: numbered[1].at)
+        for i, event in in_order_of_time:
             if event.at >= self.duration:
                 raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
             if isinstance(event, PayloadPickup):
@@ -435,14 +454,13 @@ class Scenario:
             elif isinstance(event, SensorFaultEvent):
                 self._check_has_sensor(i, event)
             elif isinstance(event, ControllerEvent):
-                try:
-                    controller = changed_controller(controller, event.fields)
-                except InputError as error:
-                    problems = getattr(error, "problems", (error,))
-                    raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from None
+                controller = _controller_after(event, i, controller)
 
     def _check_has_sensor(self, i: int, event: SensorFaultEvent) -> None:
-        """Refuse the fault of a sensor that an estimator does not have; without an estimator each is there, perfect."""
+        """Refuse the fault of a sensor that the estimator does not have.
+
+        Without an estimator the controller receives every quantity, so that each has a sensor that can fail.
+        """
         if self.estimator is None:
             return
         names: list[str] = []
@@ -467,7 +485,7 @@ class Scenario:
         """Return the controller active at a time [s]."""
         controller = self.controller
         for at, spec in self.controller_changes:
-            if at <= time + 1e-9:
+            if at <= time + 1e-9:  # of rounding
                 controller = spec
         return controller
 
@@ -500,14 +518,14 @@ class Scenario:
         Raises:
             ScenarioError: the message names every invalid field.
         """
-        if isinstance(data.get("controller"), str):
+        if isinstance(data.get("controller"), str):  # its type alone
             data = {**data, "controller": {"type": data["controller"]}}
         scenario = parse_table(cls, data, source)
         vars(scenario).update(stated=copy.deepcopy(dict(data)))
         return scenario
 
     def derive(self, tables: Mapping[str, Any], *, source: str | None = None) -> Scenario:
-        """Return the scenario of other tables, made from `tables`, checked as a file is and called `source`.
+        """Return the scenario of changed `tables` of this one, checked as a file is; messages call it `source`.
 
         Raises:
             ScenarioError: the message names every invalid field.
@@ -515,7 +533,7 @@ class Scenario:
         if source is None:
             source = self.name
         other = Scenario.parse(tables, source=source)
-        # A reference that was passed in as a function has its rows in memory.
+        # The rows of a reference that was passed in as a function are in memory, not in the tables.
         if other.reference == self.reference:
             return other.altered(reference=self.reference)
         return other
@@ -567,16 +585,26 @@ class Scenario:
         return self.written(self)
 
     def written(self, resolved: Scenario) -> str:
-        """Return the file as `to_toml`, with values of `resolved` that this scenario does not state in comments."""
+        """Return the file as `to_toml`; comments show what `resolved` has and this scenario does not state."""
         repeated: dict[str, str] = {}
         if self.recorded is not None:
-            stated = {"vehicle.file", *self.recorded.stated}
-            for table in REPEATING:
-                for name in plain(getattr(self, table) or {}):
-                    path = f"{table}.{name}"
-                    if path not in stated:
-                        repeated[path] = self.recorded.file
+            for path in self._numbers_of_vehicle():
+                if path not in self.recorded.stated:
+                    repeated[path] = self.recorded.file
         return to_toml(resolved, self._every_field(), repeated)
+
+
+def _controller_after(event: ControllerEvent, i: int, controller: AnyController) -> AnyController:
+    """Return a controller as event number `i` changes it.
+
+    Raises:
+        ValueError: the fields of the event do not fit the controller; the message names each problem.
+    """
+    try:
+        return changed_controller(controller, event.fields)
+    except InputError as error:
+        problems = getattr(error, "problems", (error,))
+        raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from None
 
 
 _FOR_USERS: Final = {*Scenario.__dataclass_fields__, "replace", "fly", "to_toml"}
