@@ -62,17 +62,17 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
         H = H + 2.0 * steps.T @ np.kron(np.eye(N), objective.Q_d) @ steps
         F_d[:nu] = -2.0 * objective.Q_d  # the first step is u(k) - u(k-1)
     if objective.P is not None:
-        # The last state has the weights Q and W so far: what is missing to its own weights is added.
+        # So far the last state has the weights Q and W of all others: the difference to its own weights is added.
         Q, W = objective.weights
         Q_end, W_end = objective.terminal_weights
-        missing_Q = Q_end - Q
-        missing_W = W_end - W
+        added_Q = Q_end - Q
+        added_W = W_end - W
         Psi_N = maps.Psi[-n:]
         Phi_N = maps.Phi[-n:]
-        H = H + 2.0 * Psi_N.T @ missing_Q @ Psi_N
-        F_x = F_x + 2.0 * Psi_N.T @ missing_Q @ Phi_N
+        H = H + 2.0 * Psi_N.T @ added_Q @ Psi_N
+        F_x = F_x + 2.0 * Psi_N.T @ added_Q @ Phi_N
         F_y = F_y.copy()
-        F_y[:, -W.shape[1] :] -= 2.0 * Psi_N.T @ missing_W
+        F_y[:, -W.shape[1] :] -= 2.0 * Psi_N.T @ added_W
     return CondensedCost(H=0.5 * (H + H.T), F_x=F_x, F_y=F_y, F_d=F_d)
 
 
@@ -88,7 +88,7 @@ class RowMaps:
 
 
 def states_rows(C: Array, of_states: RowFlags, maps: Prediction, N: int) -> RowMaps:
-    """Return the map of rows C x, with C (m, n), without their direct terms in inputs.
+    """Return the map of the part C x of rows, with C (m, n); their direct terms in inputs are not in it.
 
     Rows on states alone (`of_states`, (m,)) are at x(k+1) .. x(k+N), all others at x(k) .. x(k+N-1).
     """
@@ -157,7 +157,8 @@ class Condensed:
         self.cost = condensed_cost(problem, maps)
         self._values = row_maps(self._rows, maps)
         self._n_inputs = N * nu
-        # The rows' values (N, m, nu), and the cost's gradient (N nu, nu), per input that is held over the horizon.
+        # What an input that is held over the horizon adds, per unit, to the rows' values (N, m, nu) and to the cost's
+        # gradient (N nu, nu).
         self._values_of_held = self._values.of_inputs.reshape(N, len(self._rows.C), N, nu).sum(axis=2)
         self._gradient_of_held = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)
         l1 = problem.rows.l1[problem.rows.slacks]

@@ -294,6 +294,7 @@ class LinearMPC:
             return refused(self._acting, self.horizon, INVALID_DATA)
         answer, problem = self._solve(now.time + self.preparation.delay, query)
         reason = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._acting)
+        # The check completes the answer's statistics, and may find a reason where there is none so far.
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is None:
@@ -307,7 +308,7 @@ class LinearMPC:
         return refused(self._acting, self.horizon, reason, answer)
 
     def _slow_down(self, now: StepInputs) -> Command:
-        """Return the command of a period on the ground."""
+        """Return the command of a period on the ground, where no plan is flown."""
         self.preparation.stand(now, self._acting)
         self._acting = self._bounds.lowest(self._acting)
         self._plan = None
@@ -321,7 +322,7 @@ class LinearMPC:
         return self._obstacles.solve(time, query, self.preparation.yaw)
 
     def _accept(self, answer: Answer) -> Command:
-        """Return the first input of an accepted plan, which is on its bounds where rounding put it outside."""
+        """Return the first input of an accepted plan as the command; where rounding put it out of bounds, on them."""
         if self._holds:
             self._plan = answer.plan
             self._held = 0
