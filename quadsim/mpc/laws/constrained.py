@@ -1,8 +1,8 @@
 """`[controller] type = "constrained"`: the MPC of Eqs. (27)-(29).
 
 In every period it minimises the cost of Eq. (5) over N steps of the linear model, with hard bounds on outputs, rotor
-speeds and their steps, and flies the first input.  The table builds `quadsim.mpc.laws.parts.linear.LinearMPC` with the
-paper's own query (`NominalPreparation`).
+speeds and their steps, and flies the first input.  The table of settings builds the controller, which is
+`quadsim.mpc.laws.parts.linear.LinearMPC` with the paper's query (`NominalPreparation`).
 """
 
 from __future__ import annotations
@@ -42,9 +42,11 @@ class Constrained(Bounded):
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        # Imported here, so that reading a scenario does not load the controller.
         from quadsim.mpc.laws.parts.linear import NominalPreparation, linear_law
 
         problem = self.problem(vehicle, period)
+        preparation = NominalPreparation(problem)
         space = self.space(shapes, vehicle, period)
         solver = self.make_solver(problem, space)
-        return linear_law(self, NominalPreparation(problem), solver, space)
+        return linear_law(self, preparation, solver, space)

@@ -1,8 +1,8 @@
 """The unconstrained MPC: a constant gain.  Eqs. (21)-(26).
 
-Without constraints the optimum is linear in the query, u(k) = K_N xi(k) + G_N y_d + L_N u_bar, and the controller is
-this gain.  The constrained MPCs test the same optimum first (`quadsim.mpc.forms.condensing.FreeOptimum`): where it
-satisfies every row, they solve no QP.
+Without constraints the optimum is linear in the state and the desired outputs, u(k) = K_N xi(k) + G_N y_d + L_N u_bar:
+the gains are computed once, and a period is a product of matrices and vectors.  The constrained MPCs try the same
+optimum first (`quadsim.mpc.forms.condensing.FreeOptimum`): where it satisfies every constraint, they solve no QP.
 """
 
 from __future__ import annotations
@@ -36,15 +36,20 @@ class SequenceGains:
 
     K: Array  # (N nu, n)
     G: Array  # (N nu, N n_r)
-    L: Array  # (N nu, nu); identity in the first rows, with F3's corrected sign and the linearisation's offset
+    L: Array  # (N nu, nu), but for rounding the identity at every step: at rest on the reference, u = u_bar is optimal
 
 
 def sequence_gains(problem: Problem) -> SequenceGains:
-    """Solve Eq. (21) for the optimal sequence; bounds of the problem are ignored."""
+    """Solve Eq. (21) for the optimal sequence, without the problem's constraints.
+
+    There is no gain of the input before, u(k-1): with a weight on input changes, Q_d, it is taken to be u_bar.
+    """
     terms = condensed_cost(problem, prediction(problem.model, problem.horizon))
     factor = scipy.linalg.cho_factor(terms.H)
-    # For the paper's problem, -(F3 + F4): the cost of an input held at u_bar.
-    cost_of_u_bar = terms.H @ np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
+    # The cost is quadratic in u - u_bar, so its gradient is H u - H [I; ...; I] u_bar + F_x xi(k) + F_y y_d.  In the
+    # paper's terms, with the sign of F3 corrected, H [I; ...; I] = -(F3 + F4) (`quadsim.mpc.problem.paper.Cost`).
+    every_step = np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
+    cost_of_u_bar = terms.H @ every_step
     return SequenceGains(
         K=-scipy.linalg.cho_solve(factor, terms.F_x),
         G=-scipy.linalg.cho_solve(factor, terms.F_y),
@@ -78,7 +83,7 @@ class UnconstrainedMPC:
         self._turns = ReferenceTurns()
 
     def reset(self, speeds: Array) -> None:
-        """Forget the turn of the heading, the controller's only state."""
+        """Forget the turn of the reference's yaw, the only state."""
         self._turns.reset()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
@@ -86,7 +91,8 @@ class UnconstrainedMPC:
         if now.phase in GROUNDED:
             return stopped(np.zeros(self.problem.model.nu), self.horizon, now.phase)
         started = clock.perf_counter()
-        desired = self.problem.desired(self._turns.follow(reference, float(state[INDEX["yaw"]])))
+        yaw = float(state[INDEX["yaw"]])
+        desired = self.problem.desired(self._turns.follow(reference, yaw))
         sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset
         plan = sequence.reshape(self.horizon, -1)
         spent_s = clock.perf_counter() - started

@@ -4,8 +4,9 @@ Over N steps of a linear model, from x(k) and after the input u(k-1), the MPC mi
 
     sum_i |C_r x(k+i) - y_d(i)|^2_Qy + |u(k+i-1) - u_s|^2_Qu + |u(k+i-1) - u(k+i-2)|^2_Qd,    i = 1 .. N,
 
-where the last state may have its own weight P, about the equilibrium x_s (`Equilibrium`), subject to a tuple of
-constraints. Every formulation is built from the stacked rows of all constraints, whatever their kind.
+subject to a tuple of constraints. The inputs' target u_s belongs to an equilibrium (`Equilibrium`), and the last state
+may have a weight P of its own (`Objective`). Every formulation is built from the stacked rows of all constraints,
+whatever their kind.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -26,12 +27,15 @@ from quadsim.mpc.problem.regulator import stabilising
 from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
+SEMIDEFINITE_ROUNDING: Final = 1e-12
+"""Size of a negative eigenvalue, relative to the matrix's largest entry, that a semidefinite matrix may have."""
+
 
 class Equilibrium(NamedTuple):
     """An equilibrium of the model, x_s = A x_s + B (u_s - u_bar); u_s is also the target of the inputs."""
 
     x: Array  # (n,) x_s
-    u: Array  # (nu,) u_s [rad/s]; (N, nu) if it differs from step to step, with a model that changes
+    u: Array  # (nu,) u_s [rad/s]; (N, nu) if it differs from step to step, as it may with `Query.steps`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,20 +53,20 @@ class Objective:
 
     C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
     Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
-    Q_u: Array  # (nu, nu) weight of u - u_bar, symmetric positive definite
+    Q_u: Array  # (nu, nu) weight of u - u_s, symmetric positive definite; in the paper, u_s is always u_bar
     # (nu, nu) weight of input changes from step to step, symmetric positive semidefinite; None for none
     Q_d: Array | None = None
-    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), replaces Q_y there; symmetric
-    # positive semidefinite; None for none
+    # (n, n) weight of the last state, symmetric positive semidefinite; None for Q_y, as at all other steps.  It weighs
+    # the distance from the state x_s + C_r^+ (y_d - C_r x_s), which has the desired outputs and is closest to x_s
     P: Array | None = None
     follows_rates: bool = True  # whether desired velocities and yaw rate are the reference's; otherwise they are 0
 
     def __post_init__(self) -> None:
         for name in ("Q_y", "Q_u"):
-            _check_definite(name, getattr(self, name), least=0.0)
+            _check_definite(name, getattr(self, name))
         for name in ("Q_d", "P"):
             if getattr(self, name) is not None:
-                _check_definite(name, getattr(self, name), least=-1e-12)
+                _check_semidefinite(name, getattr(self, name))
         if self.C_r.ndim != 2 or self.Q_y.shape[0] != self.C_r.shape[0]:
             raise ParameterError("controller", "C_r", self.C_r.shape, f"of shape ({self.Q_y.shape[0]}, n)")
 
@@ -76,18 +80,19 @@ class Objective:
 
         Args:
             reference: (N, 4) x, y, z [m], yaw [rad].
-            rates: (N, 4) their rates of change (`reference_rates`); None where it `needs_rates` not.
+            rates: (N, 4) their rates of change (`reference_rates`); not read unless the objective `needs_rates`.
 
         Raises:
             ParameterError: an output depends on the rates, which are absent.
         """
-        desired: Array = np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
+        of_reference: Array = np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
         if not self.needs_rates:
-            return desired
+            return of_reference
         if rates is None:
             rule = "given where a velocity or the yaw rate has a weight: Problem.desired computes them"
             raise ParameterError("controller", "rates", None, rule)
-        return np.asarray(desired + np.dot(rates, self.C_r[:, REFERENCE_RATES].T))
+        of_rates = np.dot(rates, self.C_r[:, REFERENCE_RATES].T)
+        return np.asarray(of_reference + of_rates)
 
     @cached_property
     def weights(self) -> tuple[Array, Array]:
@@ -97,10 +102,13 @@ class Objective:
 
     @cached_property
     def terminal_weights(self) -> tuple[Array, Array]:
-        """The same for the last state, with x_s as the origin."""
+        """Q (n, n) and W (n, n_r) of the last state's cost dx' Q dx - 2 dx' W dy, up to a constant.
+
+        The deviations are dx = x(k+N) - x_s and dy = y_d - C_r x_s.
+        """
         if self.P is None:
             return self.weights
-        return (self.P, self.P @ np.linalg.pinv(self.C_r))
+        return self.P, self.P @ np.linalg.pinv(self.C_r)
 
     @property
     def move_weight(self) -> Array:
@@ -111,21 +119,19 @@ class Objective:
 
 
 def objective_of(output_weights: Mapping[str, float], speed_weights: float | Sequence[float]) -> Objective:
-    """Return C_r, Q_y and Q_u for weights of states by name, and one of all rotor speeds or one per rotor."""
+    """Return the objective with weights of states, by name, and of rotor speeds, one for all or one per rotor."""
     regulated = [name for name in STATE_NAMES if name in output_weights]
     weights = [output_weights[name] for name in regulated]
-    return Objective(
-        C_r=selection(regulated),
-        Q_y=np.diag(weights),
-        Q_u=np.diag(np.broadcast_to(np.asarray(speed_weights, float), N_ROTORS)),
-    )
+    weight_per_rotor = np.broadcast_to(np.asarray(speed_weights, float), N_ROTORS)
+    return Objective(C_r=selection(regulated), Q_y=np.diag(weights), Q_u=np.diag(weight_per_rotor))
 
 
 def reference_rates(reference: Array, period: float) -> Array:
-    """Return the velocities [m/s] and the yaw rate [rad/s] (N, 4) of a reference (N, 4), from its steps.
+    """Return the velocities [m/s] and the yaw rate [rad/s] (N, 4) of a reference (N, 4), by finite differences.
 
-    They are the mean of the steps before and after a row, and at both ends those of the parabola through three rows:
-    exact where the acceleration is constant.  Of two rows they are the one step.
+    The rates at a row are the mean of those of the steps before and after it.  At the first and the last row they are
+    the slope of the parabola through the three rows there.  Both are exact where the acceleration is constant.  If
+    there are two rows, the rates of both are those of the step between them.
 
     Args:
         reference: x, y, z [m], yaw [rad], the yaw without jumps of a turn (`quadsim.state.ReferenceTurns`).
@@ -137,12 +143,12 @@ def reference_rates(reference: Array, period: float) -> Array:
     if len(reference) < 2:
         rule = "at least 2 where a velocity or the yaw rate has a weight: it is desired as the reference changes"
         raise ParameterError("controller", "horizon", len(reference), rule)
-    steps = (reference[1:] - reference[:-1]) / period
+    of_steps = (reference[1:] - reference[:-1]) / period
     rates = np.empty_like(reference)
-    rates[1:-1] = 0.5 * (steps[:-1] + steps[1:])
-    second = min(1, len(steps) - 1)
-    rates[0] = 1.5 * steps[0] - 0.5 * steps[second]
-    rates[-1] = 1.5 * steps[-1] - 0.5 * steps[-1 - second]
+    rates[1:-1] = 0.5 * (of_steps[:-1] + of_steps[1:])
+    second = min(1, len(of_steps) - 1)  # of two rows, the only step
+    rates[0] = 1.5 * of_steps[0] - 0.5 * of_steps[second]
+    rates[-1] = 1.5 * of_steps[-1] - 0.5 * of_steps[-1 - second]
     return rates
 
 
@@ -150,7 +156,8 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequen
     """Return P (n, n) of the DARE: the unconstrained cost of bringing a state to rest over an infinite horizon.
 
     With it, the unconstrained optimum over N steps is that over an infinite horizon, except for the weight of input
-    changes, which the DARE omits.  `states` names those of the model, unless they are a vehicle's.
+    changes, which the DARE omits.  `states` are the names of the model's states in messages, unless they are a
+    vehicle's.
 
     Raises:
         ParameterError: some states would not come to rest, for example because an undamped state has no weight.
@@ -160,11 +167,13 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequen
     except ValueError as error:
         rule = f"left out, or weights on all of x, y, z and yaw: {error}"
         raise ParameterError("controller", "terminal", "lqr", rule) from error
-    return np.asarray(0.5 * (P + P.T))
+    return np.asarray(0.5 * (P + P.T))  # symmetric to the last bit, as `Objective` requires
 
 
 class CondensedQP(NamedTuple):
     """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `Problem.qp`.
+
+    It has n_x variables and n_rows rows; its bounds may be infinite.
 
     Examples:
         >>> import numpy as np
@@ -175,13 +184,13 @@ class CondensedQP(NamedTuple):
         ((200, 200), True, True)
     """
 
-    H: Array
-    f: Array
-    A: Array
-    lower: Array  # may be -inf
-    upper: Array  # may be inf
-    x_min: Array  # likewise
-    x_max: Array
+    H: Array  # (n_x, n_x)
+    f: Array  # (n_x,)
+    A: Array  # (n_rows, n_x)
+    lower: Array  # (n_rows,)
+    upper: Array  # (n_rows,)
+    x_min: Array  # (n_x,)
+    x_max: Array  # (n_x,)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -229,16 +238,22 @@ class Problem:
         if self.objective.P is not None:
             check_shape("P", self.objective.P, (n, n))
         for constraint in self.every_constraint:
-            m = constraint.lower.shape[-1]
-            for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
-                if matrix is None:
-                    continue
-                shape: tuple[int, ...] = (m, columns)
-                if matrix.ndim == 3:
-                    shape = (self.horizon, m, columns)
-                check_shape(f"{constraint.name}.{name}", matrix, shape)
-            if constraint.lower.ndim == 2:
-                check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
+            self._check_constraint(constraint)
+
+    def _check_constraint(self, constraint: Constraint) -> None:
+        """Reject a constraint whose matrices or bounds do not have the sizes of the model and the horizon."""
+        m = constraint.lower.shape[-1]
+        columns = {"C": self.model.n, "D": self.model.nu, "E": self.model.nu}
+        for name, count in columns.items():
+            matrix: Array | None = getattr(constraint, name)
+            if matrix is None:
+                continue
+            shape: tuple[int, ...] = (m, count)
+            if matrix.ndim == 3:
+                shape = (self.horizon, m, count)
+            check_shape(f"{constraint.name}.{name}", matrix, shape)
+        if constraint.lower.ndim == 2:
+            check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
 
     def __repr__(self) -> str:
         model = self.model
@@ -290,6 +305,7 @@ class Problem:
 
     @cached_property
     def _condensed(self) -> Any:
+        """A `quadsim.mpc.Condensed`, made on first use; its module imports this one, hence `shorthands` and `Any`."""
         return shorthands.condensed_form(self)
 
     def qp(
@@ -302,8 +318,8 @@ class Problem:
         `rows.scale`, a power of two that is 1 for bounds on single states.
 
         Args:
-            state: (12,) x(k) [m, m/s, rad, rad/s].  A model with rotor lag has the rotor speeds [rad/s] as well, (16,);
-                (12,) then stands for rotors at `u_before`.
+            state: (12,) x(k) [m, m/s, rad, rad/s].  A model with rotor lag has 16 states, the last four of them the
+                rotor speeds [rad/s]; if they are left out, the rotors turn at `u_before`.
             reference: (N, 4) x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
             u_before: (4,) u(k-1) [rad/s].
             equilibrium: where the model rests against a disturbance; absent for hover.
@@ -331,7 +347,7 @@ class Problem:
 
 
 class Query(NamedTuple):
-    """The data of one period: the arguments of the problem.
+    """What differs from period to period, and with the `Problem` determines the optimum.
 
     Examples:
         >>> import numpy as np
@@ -348,28 +364,38 @@ class Query(NamedTuple):
     desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
     u_before: Array  # (nu,) u(k-1) [rad/s]
     equilibrium: Equilibrium | None = None  # None for the problem's own
-    # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's model
+    # A (N, n, n), B (N, n, nu) and c (N, n) of a model that changes from step to step, x(k+i+1) = A_i x(k+i) +
+    # B_i u(k+i) + c_i; None for the problem's model
     steps: tuple[Array, Array, Array] | None = None
 
 
 def predicted(problem: Problem, query: Query, plan: Array) -> Array:
-    """(N, n) the predicted states of a plan (N, nu)."""
-    states = np.empty((len(plan), query.state.size))
-    state = query.state
+    """Return (N, n) the states x(k+1) .. x(k+N) that the model predicts for a plan (N, nu)."""
     if query.steps is not None:
-        A, B, c = query.steps
-        pushes = np.matmul(B, plan[:, :, None])[:, :, 0]
-        for A_i, push, c_i, row in zip(A, pushes, c, states, strict=True):
-            state = np.dot(A_i, state, row)
-            np.add(state, push, state)
-            np.add(state, c_i, state)
-        return states
+        return _predicted_by_steps(query.state, query.steps, plan)
     model = problem.model
     x_s, u_s = query.equilibrium or problem.equilibrium
-    state = state - x_s
-    for i, push in enumerate((plan - u_s) @ model.B.T):
-        states[i] = state = model.A @ state + push
-    return states + x_s
+    of_inputs = (plan - u_s) @ model.B.T
+    deviations = np.empty((len(plan), query.state.size))
+    deviation = query.state - x_s
+    for i, of_input in enumerate(of_inputs):
+        deviation = model.A @ deviation + of_input
+        deviations[i] = deviation
+    return deviations + x_s
+
+
+def _predicted_by_steps(state: Array, steps: tuple[Array, Array, Array], plan: Array) -> Array:
+    """Return the same for a model that changes from step to step (`Query.steps`), from the state x(k)."""
+    A, B, c = steps
+    of_inputs = np.matmul(B, plan[:, :, None])[:, :, 0]
+    states = np.empty((len(plan), state.size))
+    before = state
+    for A_i, of_input, c_i, after in zip(A, of_inputs, c, states, strict=True):
+        np.dot(A_i, before, out=after)
+        np.add(after, of_input, out=after)
+        np.add(after, c_i, out=after)
+        before = after
+    return states
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -384,32 +410,47 @@ class InfeasiblePeriod:
         (0.0, True)
     """
 
-    problem: Problem  # the problem
-    query: Query  # the state and reference without a solution; state and input are copied
+    problem: Problem  # the optimal control problem of that period
+    query: Query  # the state and reference without a solution
     status: str  # why the answer was rejected
     time: float  # t_k, start of the period [s]
     delay: float = 0.0  # from t_k to the instant of x(k) [s]
     converges: Callable[[int], bool] | None = None  # if the SQP did not converge: whether it does within n iterations
 
     def __post_init__(self) -> None:
-        query = self.query
-        object.__setattr__(self, "query", query._replace(state=query.state.copy(), u_before=query.u_before.copy()))
+        # A controller may overwrite its state and its last command in the next period.
+        state = self.query.state.copy()
+        u_before = self.query.u_before.copy()
+        object.__setattr__(self, "query", self.query._replace(state=state, u_before=u_before))
 
 
 def check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
-    """Raise `ParameterError` unless an array of `[controller]` has a shape."""
+    """Raise `ParameterError` if an array of the controller, by its name in messages, does not have this shape."""
     if value.shape != shape:
         raise ParameterError("controller", name, value.shape, f"of shape {shape}")
 
 
-def _check_definite(name: str, matrix: Array, *, least: float) -> None:
-    """Reject a matrix that is not symmetric, or with an eigenvalue of at most `least` (times the largest entry)."""
-    symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
-    strict = least == 0.0
-    if symmetric and np.all(np.isfinite(matrix)):
-        smallest = np.linalg.eigvalsh(matrix).min(initial=math.inf)
-        limit = least * np.abs(matrix).max(initial=0.0)
-        if smallest > limit or (not strict and smallest >= limit):
+def _check_definite(name: str, matrix: Array) -> None:
+    """Reject a matrix that is not symmetric and positive definite."""
+    if not _is_symmetric(matrix) or not _smallest_eigenvalue(matrix) > 0.0:
+        raise ParameterError("controller", name, matrix.tolist(), "symmetric and positive definite")
+
+
+def _check_semidefinite(name: str, matrix: Array) -> None:
+    """Reject a matrix that is not symmetric and, but for rounding, positive semidefinite."""
+    if _is_symmetric(matrix):
+        rounding = SEMIDEFINITE_ROUNDING * np.abs(matrix).max(initial=0.0)
+        if _smallest_eigenvalue(matrix) >= -rounding:
             return
-    kind = "definite" if strict else "semidefinite"
-    raise ParameterError("controller", name, matrix.tolist(), f"symmetric and positive {kind}")
+    raise ParameterError("controller", name, matrix.tolist(), "symmetric and positive semidefinite")
+
+
+def _is_symmetric(matrix: Array) -> bool:
+    """Return whether a matrix is symmetric, and all its entries are finite."""
+    square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
+    return square and np.array_equal(matrix, matrix.T) and bool(np.all(np.isfinite(matrix)))
+
+
+def _smallest_eigenvalue(matrix: Array) -> float:
+    """Return the smallest eigenvalue of a symmetric matrix; infinite for one without entries."""
+    return float(np.linalg.eigvalsh(matrix).min(initial=math.inf))

@@ -30,7 +30,7 @@ class SolverEntry:
 
     description: str  # one line
     package: str  # import name
-    dense: bool = True  # whether it takes the condensed QP instead of the staged one
+    dense: bool = True  # whether it takes the condensed QP; otherwise it takes the staged one
     extra: str = ""  # quadsim's extra that installs the package; empty if it is always installed
 
     def formulate(self, problem: Problem) -> Formulation:
@@ -42,18 +42,13 @@ class SolverEntry:
     @property
     def installed(self) -> bool:
         """Whether the package is installed; it is not imported yet."""
-        return not self._missing
+        return importlib.util.find_spec(self.package) is not None
 
     @property
     def line(self) -> str:
-        """The description, with the command that installs a missing package."""
-        return self._missing or self.description
-
-    @property
-    def _missing(self) -> str:
-        installed = importlib.util.find_spec(self.package) is not None
-        if installed:
-            return ""
+        """The description, or the command that installs a missing package."""
+        if self.installed:
+            return self.description
         return f"not installed: pip install 'quadsim[{self.extra}]'"
 
 
@@ -72,29 +67,33 @@ COMPILED: Final = SolverEntry(
 )
 
 CORES_SECOND: Final = "piqp-multistage"
-"""What answers the problems that the core gives up."""
+"""The QP solver of the problems that the core gives up."""
 
 ALIASES: Final = {"piqp": "piqp-multistage"}
+"""Other names of solvers, and the solvers that they stand for."""
 SUCCESSORS: Final = {"piqp-multistage-1": "piqp-multistage", "core-or-piqp": CORE}
-"""What to use for solvers of earlier versions."""
+"""Solvers of earlier versions, and what to use in their place."""
 
 INVALID_DATA: Final = "invalid_data"
-"""Status of a query with numbers that no back end receives."""
+"""Status of a query with numbers that are not finite, or out of range; no back end receives it."""
 
 
 def find_solver(name: str) -> SolverEntry:
     """Return the solver of a name: the core, one of `SOLVERS` or of qpsolvers; `UnknownNameError` if there is none."""
     name = ALIASES.get(name, name)
-    if name in (CORE, *SOLVERS):
-        return SOLVERS.get(name, COMPILED)
+    if name == CORE:
+        return COMPILED
+    if name in SOLVERS:
+        return SOLVERS[name]
     entries = solver_entries()
-    if name not in entries:
-        if len(entries) > len(SOLVERS) + 1:
-            hint = ""
-        else:
-            hint = "pip install 'quadsim[solvers]' adds those of qpsolvers"
-        raise UnknownNameError("solver", name, entries, hint, successor=SUCCESSORS.get(name))
-    return entries[name]
+    if name in entries:
+        return entries[name]
+    has_qpsolvers = len(entries) > len(SOLVERS) + 1
+    if has_qpsolvers:
+        hint = ""
+    else:
+        hint = "pip install 'quadsim[solvers]' adds those of qpsolvers"
+    raise UnknownNameError("solver", name, entries, hint, successor=SUCCESSORS.get(name))
 
 
 def solver_entries() -> dict[str, SolverEntry]:
@@ -104,14 +103,21 @@ def solver_entries() -> dict[str, SolverEntry]:
         return entries
     from qpsolvers import available_solvers  # imports every installed solver
 
-    for name in sorted({*available_solvers} - {*entries, *ALIASES}):
+    for name in sorted(available_solvers):
+        if name in entries or name in ALIASES:
+            continue
         description = f"{name} through qpsolvers, condensed, set up anew in each period"
         entries[name] = SolverEntry(description=description, package="qpsolvers", extra="solvers")
     return entries
 
 
 def make_backend(name: str) -> Backend:
-    """Return a new back end of a named QP solver; raises `UnknownNameError`, or `MissingPackageError`."""
+    """Return a new back end of a named QP solver.
+
+    Raises:
+        UnknownNameError: there is no such QP solver.
+        MissingPackageError: its package is not installed.
+    """
     if name == CORE:
         raise UnknownNameError("QP solver", name, SOLVERS, "use make_solver")
     entry = find_solver(name)
@@ -125,7 +131,7 @@ def make_backend(name: str) -> Backend:
         from quadsim.mpc.solvers.daqp import DaqpDense
 
         return DaqpDense()
-    if name in SOLVERS:
+    if name in SOLVERS:  # a solver that was added to the list, but not here
         raise UnknownNameError("QP solver", name, SOLVERS, "make_backend cannot make one")
     from quadsim.mpc.solvers.qpsolvers import AnyOfQpsolvers
 
@@ -133,11 +139,14 @@ def make_backend(name: str) -> Backend:
 
 
 class Method(IntEnum):
-    """The part of the QP that had to be solved, by the codes of `enum quadsim_found`; other codes mean no optimum."""
+    """The part of the QP that had to be solved, with the codes of C (`enum quadsim_found`).
 
-    FREE = 0  # none: the unconstrained optimum
-    AXES = 1  # active rows of states alone
-    WHOLE = 2
+    All other codes of that enumeration mean that no optimum was found.
+    """
+
+    FREE = 0  # none: the unconstrained optimum satisfies every constraint
+    AXES = 1  # each axis (`quadsim.mpc.solvers.core_axes`) by itself, with its rows of states alone
+    WHOLE = 2  # all of it
 
 
 class Answer(NamedTuple):
@@ -145,20 +154,21 @@ class Answer(NamedTuple):
 
     plan: Array  # (N, nu) inputs [rad/s]; valid only if the status is accepted
     slacks: Array  # (N, m_s) violations of soft rows
-    status: str  # `solved`, `unconstrained`, or the reason of a failure
+    status: str  # `solved`, `unconstrained`, or the reason for a failure
     answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
     stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `AnswerCheck`
     method: Method = Method.WHOLE  # the part of the QP that had to be solved
-    certificate: Callable[[], tuple[QP, Solution]] | None = None  # the QP and its solution; None for invalid data
+    # makes the QP and its solution, from which KKT residuals are computed; None for invalid data
+    certificate: Callable[[], tuple[QP, Solution]] | None = None
 
     @classmethod
     def of(cls, form: Formulation, qp: QP, solution: Solution, answered_by: str) -> Answer:
         """Convert a solver's solution of a QP to a plan and slacks."""
         return cls(
-            form.inputs(solution.x),
-            form.slacks(solution.x),
-            solution.status,
-            answered_by,
+            plan=form.inputs(solution.x),
+            slacks=form.slacks(solution.x),
+            status=solution.status,
+            answered_by=answered_by,
             stats=solution.stats,
             certificate=lambda: (qp, solution),
         )
@@ -209,20 +219,21 @@ class QPSolver:
         self.formulation = find_solver(name).formulate(problem)
         self._free: FreeOptimum | None = None
         if free_first:
+            condensed = None
             if isinstance(self.formulation, Condensed):
                 condensed = self.formulation
-            else:
-                condensed = None
             self._free = FreeOptimum.of(problem, condensed)
         self.reset()
 
     @property
     def iterates(self) -> frozenset[str]:
-        """See `Solver`; qpsolvers does not tell iterations."""
-        return frozenset({self.name} & set(SOLVERS))
+        """See `Solver`; those of qpsolvers do not report their iterations."""
+        if self.name in SOLVERS:
+            return frozenset({self.name})
+        return frozenset()
 
     def reset(self) -> None:
-        """See `Solver.reset`: back ends that start from their last answer restart from scratch."""
+        """See `Solver.reset`: a new back end replaces one that would start from its last answer."""
         self._backend = make_backend(self.name)
         self._backend.setup(self.formulation.qp)
 
@@ -231,15 +242,18 @@ class QPSolver:
 
         Data that is not finite gives the status `invalid_data`, since back ends may not notice it.
         """
-        state, desired, u_before = query[:3]
         form = self.formulation
-        if not math.isfinite(state.sum() + desired.sum() + u_before.sum()):
+        if not _is_finite(query):
             no_solution = np.full_like(form.qp.c, math.nan)
-            return Answer(form.inputs(no_solution), form.slacks(no_solution), INVALID_DATA, self.name)
+            return Answer(
+                plan=form.inputs(no_solution),
+                slacks=form.slacks(no_solution),
+                status=INVALID_DATA,
+                answered_by=self.name,
+            )
         started = clock.perf_counter()
-        if self._free is None:
-            answer = None
-        else:
+        answer = None
+        if self._free is not None:
             answer = _free_answer(self._free, query)
         spent_s = clock.perf_counter() - started
         if answer is None:
@@ -249,17 +263,26 @@ class QPSolver:
         return answer._replace(stats=answer.stats._replace(solve_s=spent_s))
 
 
+def _is_finite(query: Query) -> bool:
+    """Return whether state, desired outputs and last input are finite: a sum is not if any of its terms is not."""
+    total = query.state.sum() + query.desired.sum() + query.u_before.sum()
+    return math.isfinite(total)
+
+
 def _free_answer(free: FreeOptimum, query: Query) -> Answer | None:
-    """Return the unconstrained optimum; None if it violates a constraint.  Only its certificate needs a QP."""
+    """Return the unconstrained optimum; None if it violates a constraint.
+
+    The QP is assembled only if the answer's certificate is asked for.
+    """
     solution = free.solve(query)
     if solution is None:
         return None
     form = free.form
     return Answer(
-        form.inputs(solution.x),
-        form.slacks(solution.x),
-        solution.status,
-        GAIN,
+        plan=form.inputs(solution.x),
+        slacks=form.slacks(solution.x),
+        status=solution.status,
+        answered_by=GAIN,
         method=Method.FREE,
         certificate=lambda: (form.assemble(query), solution),
     )

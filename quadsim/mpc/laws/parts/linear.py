@@ -1,8 +1,9 @@
-"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement.
+"""The linear MPC: in every period it solves the optimisation of Eq. (27), from a query made of the measurements.
 
 A step is: measurement -> `Preparation.prepare` -> `Query` -> solver -> `Answer` -> check -> `Command`.  The problem
-(model, cost, constraints) is built once; the query has the vectors of the period.  The paper's constrained MPC and the
-robust MPC differ only in their preparation.
+(model, cost, constraints) is built once; the query has what differs from period to period: the state, the desired
+outputs, the last command and the equilibrium.  The paper's constrained MPC and the robust MPC differ only in their
+preparation.
 """
 
 from __future__ import annotations
@@ -33,19 +34,19 @@ if TYPE_CHECKING:
 class Remembered(NamedTuple):
     """What a preparation remembers of its vehicle, for another one to take over in flight."""
 
-    delay: float  # [s] from t_k to the instant of x(k)
-    rotors: Array  # (4,) speeds when the next command takes over [rad/s]
-    turning: Array  # (4,) and when the last one sent does
+    delay: float  # from t_k to the instant of x(k), at which the command of period k takes over [s]
+    rotors: Array  # (4,) rotor speeds at the instant of this period at which the next command takes over [rad/s]
+    turning: Array  # (4,) rotor speeds at the instant of x(k), after all commands under way [rad/s]
     sent: tuple[Array, ...]  # the last commands sent (4,), oldest first [rad/s]
-    ahead: Array | None  # (12,) state there; None if it is not known
-    called_at: float  # [s] time of the last call
-    measured: float  # [s] and of the last measured state
+    ahead: Array | None  # (12,) predicted state at the instant of `rotors`; None if it is not known
+    called_at: float  # time of the last call [s]
+    measured: float  # time of the last measured state [s]
     estimate: Array | None  # (6,) of the observer, as `quadsim.mpc.estimate.observer` says; None without one
     targets: bool  # whether commands are an inner loop's targets, not rotor speeds
 
 
 class Preparation(Protocol):
-    """From the measurements of a period to the query of its optimisation; what it remembers is from periods before."""
+    """Makes the query of each period from its measurements, and from what it remembers of earlier periods."""
 
     @property
     def problem(self) -> Problem:
@@ -59,7 +60,7 @@ class Preparation(Protocol):
 
     @property
     def numbers(self) -> CoreNumbers | None:
-        """The numbers of a controller that is C's; None for another."""
+        """The numbers of the same controller in C; None if there is none."""
         ...
 
     @property
@@ -74,7 +75,7 @@ class Preparation(Protocol):
 
     @property
     def disturbance(self) -> Array | None:
-        """(6,) its estimate, accelerations [m/s^2] and angular ones [rad/s^2]; None where there is no such estimate."""
+        """(6,) estimated accelerations [m/s^2] and angular accelerations [rad/s^2]; None where none are estimated."""
         ...
 
     def reset(self, speeds: Array) -> None:
@@ -83,11 +84,16 @@ class Preparation(Protocol):
 
     @property
     def memory(self) -> Remembered | None:
-        """What another preparation may take over; None for nothing."""
+        """What another preparation may take over; None if there is nothing."""
         ...
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
-        """Take over what the previous controller has learnt: its preparation's memory, if any, its `disturbance`."""
+        """Take over what the previous controller has learnt.
+
+        Args:
+            memory: of its preparation; None if it has none.
+            disturbance: as of `disturbance`; None if it estimates none.
+        """
         ...
 
     def stand(self, now: StepInputs, acting: Array) -> None:
@@ -95,7 +101,7 @@ class Preparation(Protocol):
         ...
 
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
-        """Return the query of a period in the air, to call once per period; None if its numbers are out of range.
+        """Return the query of a period in the air; None if its numbers are out of range.  It is called once per period.
 
         Args:
             now: time, and inputs besides the state.
@@ -111,7 +117,9 @@ class Preparation(Protocol):
 
 
 class NominalPreparation:
-    """The paper's query: the measured state, and the reference on the turn of its yaw, about hover.
+    """Makes the paper's query, about hover: the measured state, the desired outputs and the last command.
+
+    The reference's yaw is moved by whole turns to the turn of the measured yaw (`quadsim.state.ReferenceTurns`).
 
     Examples:
         >>> import numpy as np
@@ -125,15 +133,19 @@ class NominalPreparation:
         ((12,), (50, 4))
     """
 
-    delay = yaw = 0.0
-    trim = disturbance = memory = numbers = None
+    delay = 0.0
+    yaw = 0.0
+    trim = None
+    disturbance = None
+    memory = None
+    numbers = None
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._turns = ReferenceTurns()
 
     def reset(self, speeds: Array) -> None:
-        """Forget the turn of the heading, its only state."""
+        """Forget the turn of the reference's yaw, the only state."""
         self._turns.reset()
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
@@ -143,9 +155,10 @@ class NominalPreparation:
         """Change nothing."""
 
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query:
-        """See `Preparation.prepare`; solvers refuse numbers that are not finite."""
-        reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
-        return Query(state, self.problem.desired(reference), acting)
+        """See `Preparation.prepare`; it always returns a query, since solvers refuse numbers that are not finite."""
+        yaw = float(state[INDEX["yaw"]])
+        desired = self.problem.desired(self._turns.follow(reference, yaw))
+        return Query(state=state, desired=desired, u_before=acting)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -157,9 +170,10 @@ class LinearMPC:
 
     If the unconstrained optimum satisfies every constraint, it is the solution and no QP is solved; the status is then
     `unconstrained`.  The controller uses an answer only if it is solved and finite, its first input is within the hard
-    bounds, and its plan satisfies the problem's rows (`AnswerCheck`).  Otherwise it reports the
-    status with the command in force, for a fallback to act on; or, if it `holds` plans, it flies the previous one,
-    shifted by one step (fallback level 1), for as long as that lasts, and then ends the flight.
+    bounds, and its plan satisfies the problem's rows (`AnswerCheck`).  Otherwise a controller that holds plans flies
+    the last accepted one, one step further in each period (fallback level 1), and ends the flight when the plan has no
+    step left.  Any other controller repeats the command in force, with the reason as its status, for a fallback to act
+    on.
 
     States, units and frames: `docs/conventions.md`.
 
@@ -168,7 +182,7 @@ class LinearMPC:
         problem: the optimal control problem.
         commands: what it commands: rotor speeds, or an autopilot's targets.
         infeasible_period: the first period since `reset` whose QP had no answer; None if there was none.
-        answer: the answer of the last period that solved a QP; None before the first.
+        answer: the solver's last answer; None before the first.
 
     Examples:
         >>> import numpy as np
@@ -218,14 +232,15 @@ class LinearMPC:
             self._obstacles = None
         else:
             self._obstacles = ObstacleQP(self.problem, solver, space)
-        self._bounds, self._check = ActuatorBounds.of_problem(self.problem), AnswerCheck(self.problem, kkt_every)
+        self._bounds = ActuatorBounds.of_problem(self.problem)
+        self._check = AnswerCheck(self.problem, kkt_every)
         self.reset(self.problem.model.u_bar)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
-        self._acting = np.array(speeds, float)
-        self._plan: Array | None = None  # the last accepted one, if it holds plans
-        self._held = 0  # periods for which it has been held
+        self._acting = np.array(speeds, float)  # (4,) the command in force, u(k-1) [rad/s]
+        self._plan: Array | None = None  # the last accepted plan; always None for a controller that does not hold plans
+        self._held = 0  # periods for which it has been held so far
         self.infeasible_period: InfeasiblePeriod | None = None
         self.preparation.reset(self._acting)
         self._solver.reset()
@@ -234,7 +249,7 @@ class LinearMPC:
             self._obstacles.reset()
 
     def adopt(self, previous: object) -> None:
-        """Take over what the previous controller has learnt, and its plan, to hold if a QP has no answer."""
+        """Take over what the previous controller has learnt, and the plan that it would hold if a QP had no answer."""
         memory = None
         if isinstance(previous, LinearMPC):
             memory = previous.preparation.memory
@@ -273,37 +288,55 @@ class LinearMPC:
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         if now.phase in GROUNDED:
-            self.preparation.stand(now, self._acting)
-            self._acting = self._bounds.lowest(self._acting)
-            self._plan = None
-            self._held = 0
-            return stopped(self._acting.copy(), self.horizon, now.phase)
+            return self._slow_down(now)
         query = self.preparation.prepare(now, state, reference, self._acting)
         if query is None:
             return refused(self._acting, self.horizon, INVALID_DATA)
-        answer, problem = self._solved(now.time + self.preparation.delay, query)
+        answer, problem = self._solve(now.time + self.preparation.delay, query)
         reason = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._acting)
+        # The check completes the answer's statistics, and may find a reason where there is none so far.
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is None:
-            self._plan = None
-            if self._holds:
-                self._plan = answer.plan
-            self._held = 0
-            self._acting = self._bounds.clip(answer.plan[0], self._acting)
-            return command_of(self._acting, answer.plan, answer.status, answer)
+            return self._accept(answer)
         if reason != INVALID_DATA and self.infeasible_period is None:
             self.infeasible_period = InfeasiblePeriod(
                 problem=problem, query=query, status=reason, time=now.time, delay=self.preparation.delay
             )
-        if not self._holds:
-            return refused(self._acting, self.horizon, reason, answer)
+        if self._holds:
+            return self._hold_plan(answer, reason, now.time)
+        return refused(self._acting, self.horizon, reason, answer)
+
+    def _slow_down(self, now: StepInputs) -> Command:
+        """Return the command of a period on the ground, where no plan is flown."""
+        self.preparation.stand(now, self._acting)
+        self._acting = self._bounds.lowest(self._acting)
+        self._plan = None
+        self._held = 0
+        return stopped(self._acting.copy(), self.horizon, now.phase)
+
+    def _solve(self, time: float, query: Query) -> tuple[Answer, Problem]:
+        """Return the optimum of a query whose x(k) is at a time [s], and the problem with the rows of obstacles."""
+        if self._obstacles is None:
+            return self._solver.solve(query), self.problem
+        return self._obstacles.solve(time, query, self.preparation.yaw)
+
+    def _accept(self, answer: Answer) -> Command:
+        """Return the first input of an accepted plan as the command; where rounding put it out of bounds, on them."""
+        if self._holds:
+            self._plan = answer.plan
+            self._held = 0
+        self._acting = self._bounds.clip(answer.plan[0], self._acting)
+        return command_of(self._acting, answer.plan, answer.status, answer)
+
+    def _hold_plan(self, answer: Answer, reason: str, time: float) -> Command:
+        """Return the next input of the last accepted plan, in place of an answer that is rejected for a reason."""
         if self._plan is None or self._held + 1 >= self.horizon:
             if self._held:
-                held = f"after holding the last plan for {self._held} periods"
-            else:
-                held = "with no plan to hold"
-            raise PlanExhaustedError(f"the solver answered {reason!r} {held}", time=now.time)
+                raise PlanExhaustedError(
+                    f"the solver answered {reason!r} after holding the last plan for {self._held} periods", time=time
+                )
+            raise PlanExhaustedError(f"the solver answered {reason!r} with no plan to hold", time=time)
         self._held += 1
         self._acting = self._bounds.clip(self._plan[self._held], self._acting)
         return command_of(self._acting, shifted(self._plan, self._held), reason, answer, fallback=1)
@@ -313,20 +346,18 @@ class LinearMPC:
         return self.preparation.predict(states, plans)
 
     def in_core(self, fallback: Struct) -> CoreLaw | None:
-        """Return it with a fallback contract of these numbers in the core; None where it is not C's alone."""
+        """Return this controller with its fallback contract as one controller of the core; None if a part is Python's.
+
+        Args:
+            fallback: the contract's numbers, a `quadsim_fallback`.
+        """
         if self._holds or self._obstacles is not None:
             return None
         return core_law(self.problem, self.preparation.numbers, self._solver, self._check, fallback)
 
-    def _solved(self, time: float, query: Query) -> tuple[Answer, Problem]:
-        """Return the optimum of a query whose x(k) is at a time [s], and the problem solved."""
-        if self._obstacles is None:
-            return self._solver.solve(query), self.problem
-        return self._obstacles.solve(time, query, self.preparation.yaw)
-
 
 def linear_law(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
-    """Return the controller of a table with the parts that it is made of; see `LinearMPC`."""
+    """Return the `LinearMPC` of a table of settings and of the parts that are built from it."""
     return LinearMPC(
         preparation,
         solver,
