@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import scipy.linalg
 from support import paper_problem, paper_reference
 
 from quadsim.controller import StepInputs
+from quadsim.errors import ParameterError
 from quadsim.mpc.laws.unconstrained import UnconstrainedMPC, sequence_gains
 from quadsim.state import Array
 
@@ -46,6 +48,15 @@ def test_feedforward_of_u_bar_is_the_identity() -> None:
     """What Eq. (26) is for; with F3 as printed it would be far from it."""
     gains = sequence_gains(paper_problem("paper-unconstrained"))
     np.testing.assert_allclose(gains.L[:4], np.eye(4), atol=1e-7)
+
+
+def test_a_weight_on_input_changes_is_refused() -> None:
+    """Its optimum depends on u(k-1), for which the law has no gain."""
+    problem = paper_problem("paper-unconstrained")
+    weighted = replace(problem, objective=replace(problem.objective, Q_d=0.1 * np.eye(4)))
+    with pytest.raises(ParameterError, match="Q_d must be None or zero"):
+        UnconstrainedMPC(weighted)
+    UnconstrainedMPC(replace(problem, objective=replace(problem.objective, Q_d=np.zeros((4, 4)))))
 
 
 def test_weights_with_thirteen_entries_are_read_as_twelve() -> None:
