@@ -58,7 +58,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(table: type[Any]) -> dict[str, Columns]:
-    """Return the columns of a table's written fields, by field and in order; those that default to None are optional."""
+    """Return the columns of a table's written fields, in order, by field; those that default to None are optional."""
     by_field = {}
     for table_field in fields(table):
         metadata = table_field.metadata
