@@ -31,7 +31,10 @@ class Result:
 
     @property
     def exit_status(self) -> int:
-        """Exit status of the command: 0, or 1 where a constraint or requirement is violated, or a number is not as expected."""
+        """Exit status of the command.
+
+        It is 0, or 1 where a constraint or requirement is violated, or a number is not as expected.
+        """
         return EXIT_DONE
 
     def shown(self) -> Shown:
