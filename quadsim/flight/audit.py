@@ -354,7 +354,7 @@ class Limit:
         if self.tolerance_sampled is not None:
             return max(default, self.tolerance_sampled), self.tolerance_sampled
         if self.tolerance is not None:
-            proportion = 1.0
+            proportion = 1.0  # of defaults that are 0
             if default:
                 proportion = default_sampled / default
             return self.tolerance, self.tolerance * proportion
@@ -572,7 +572,7 @@ def limit_differences(first: Sequence[Limit], second: Sequence[Limit], *, demand
 
 
 def _field_differences(limit: Limit, other: Limit, compared: Sequence[str]) -> list[str]:
-    """Return in which of the compared fields two limits of one name differ."""
+    """Return in which of the compared attributes two limits of one name differ, a line per difference."""
     lines = []
     for attribute in compared:
         value = getattr(limit, attribute, None)
@@ -631,7 +631,7 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
     values = limit.source.sampled(log.control)
     sampled = _nearest(limit, t, values)
     has_periods = t.size > 0
-    if has_periods:  # a flight that ends before its first period has no finding, though the plant has a row
+    if has_periods:  # a flight that ends before its first period is not judged, though the plant has a row
         t, values = limit.source.finest(log)
     finest = _nearest(limit, t, values)
     peak_plant = finest.value
@@ -677,7 +677,7 @@ def _nearest(limit: Limit, t: Array, values: Array) -> _Nearest:
     to_upper = limit.upper - columns[row]
     to_lower = columns[row] - limit.lower
     distances = np.concatenate([to_upper, to_lower])
-    first = first_smallest([*distances, smallest], limit.tie)  # not the last: the row's margin is tied with it
+    first = first_smallest([*distances, smallest], limit.tie)  # not the last: one of the distances is tied with it
     column = first % to_upper.size
     if first < to_upper.size:
         value = columns[:, column].max()
