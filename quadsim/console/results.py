@@ -22,15 +22,19 @@ Shown: TypeAlias = "Iterable[RenderableType]"
 EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
+"""Exit statuses of commands."""
 _MOST_LINES: Final = 9  # of the text of a result that `repr` shows
 
 
 class Result:
-    """A result of the functions of `quadsim.commands.app` that users and programs read."""
+    """What a function of `quadsim.commands.app` returns: users read its text, programs its data."""
 
     @property
     def exit_status(self) -> int:
-        """Exit status of the command: 0, or 1 where a constraint or requirement is violated, or a number is off."""
+        """Exit status of the command.
+
+        It is 0, or 1 where a constraint or requirement is violated, or a number is not as expected.
+        """
         return EXIT_DONE
 
     def shown(self) -> Shown:
@@ -75,11 +79,12 @@ class Result:
         return console.to_html(self._parts()) + plot_html(self.small_plot())
 
     def _parts(self) -> Shown:
+        """Return all that is shown: the result, then the last lines."""
         return [*self.shown(), *self.outputs()]
 
 
 class Tabular(Result):
-    """A result with rows of numbers, for an analysis of one's own."""
+    """A result with rows of numbers that users can analyse further."""
 
     def records(self) -> list[dict[str, Any]]:
         """Return its rows by column, numbers as numbers; None where a row has no value."""
@@ -108,7 +113,7 @@ def require_pandas() -> None:
 
 
 def plot_html(figure: Figure | None) -> str:
-    """Return a plot for a notebook, or a line where it cannot be drawn; nothing without one."""
+    """Return a plot for a notebook as HTML: empty without a plot, and a line of text where it cannot be drawn."""
     if figure is None:
         return ""
     from quadsim.report.to_matplotlib import figure_html
@@ -121,10 +126,11 @@ def plot_html(figure: Figure | None) -> str:
 
 @contextlib.contextmanager
 def after(result: Result, output: Path) -> Iterator[None]:
-    """Write an output that the user asked for, once its result is there: an error carries the result, shown first.
+    """Surround the writing of an output whose result is there already: an error carries the result, to be shown first.
 
     Raises:
-        OutputError: whatever failed, if it was none of ours.
+        QuadsimError: as the block raised it.
+        OutputError: in place of any other exception.
     """
     try:
         yield

@@ -2,8 +2,8 @@
 
     margin = min(value - lower, upper - value)    [negative beyond a bound; violated where it is below -tolerance]
 
-A QP bounds the samples of a linear model; the audit reads the plant between them, too, of a `quadsim.flight.log`.  What
-a margin, a tolerance, a violation, the worst finding and the verdict on a flight are is defined here and nowhere else.
+A QP bounds the samples of a linear model; the audit of a flight's log reads the plant between the samples, too.  This
+module alone defines margins, tolerances, violations, the worst finding, and the verdict on a flight.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ UNAUDITED_ADVICE: Final = (
 """What to do about an unaudited flight."""
 COMMAND_SIGNALS: Final = ("speed", "slew")
 """Signals that the controller sets itself."""
+_TIME_ROUNDING: Final = 1e-9
+"""Instants this close to the end of a time window [s] are within it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,18 +66,20 @@ class Tolerance:
 
     def of(self, half_band: float) -> tuple[float, float]:
         """Return both in the signal's unit."""
-        scale = half_band if self.of_band else 1.0
+        scale = 1.0
+        if self.of_band:
+            scale = half_band
         return self.plant * scale, self.sampled * scale
 
 
 MOTION: Final = Tolerance(plant=0.01, sampled=0.002)
-"""Of quantities that a controller bounds at its samples, and that overshoot between them."""
+"""Tolerance of quantities that a controller bounds at its samples, and that overshoot between them."""
 AT_SAMPLES: Final = Tolerance(plant=0.01, sampled=0.01)
-"""Of quantities that exist only at the samples, and that no controller bounds."""
+"""Tolerance of quantities that exist only at the samples, and that no controller bounds."""
 COMMAND_TOLERANCE: Final = Tolerance(plant=1e-6, sampled=1e-6, of_band=False)
-"""Of commands [rad/s]."""
+"""Tolerance of commands [rad/s]."""
 ZERO_TOLERANCE: Final = Tolerance(plant=0.0, sampled=0.0)
-"""Of clearances."""
+"""Tolerance of clearances."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +91,7 @@ class Signal:
     plant: Callable[[PlantLog], Array] | None
     """log -> (M,) or (M, j) values at the physics rate, or None for a quantity that exists only at samples."""
     tolerance: Tolerance = MOTION  # default tolerances of its limits
-    gaps: bool = False  # whether it has no value at some instants, NaN, which no limit judges
+    gaps: bool = False  # whether it may be NaN at some instants, which limits then skip
 
     def finest(self, log: FlightLog | PeriodLog) -> tuple[Array, Array]:
         """Return times [s] and values at the plant's rate, or at the control samples if the plant has none."""
@@ -115,10 +119,10 @@ def _body_rate(axis: int) -> Signal:
     def rates(states: Array) -> Array:
         return np.degrees(euler_to_body_rates(states[:, EULER], states[:, EULER_RATE])[:, axis])
 
-    def plant(log: PlantLog) -> Array:  # Euler rates lose precision near the vertical
+    def plant(log: PlantLog) -> Array:
         if log.body_rates is None:
             return rates(log.state)
-        return np.degrees(log.body_rates[:, axis])
+        return np.degrees(log.body_rates[:, axis])  # Euler rates lose precision near the vertical
 
     return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
 
@@ -293,12 +297,12 @@ class Limit:
             raise ParameterError(owner, "stop", self.stop, f"at least start = {self.start}")
 
     def _check_signal(self) -> None:
-        if (self.signal == SUM) != bool(self.terms):
-            if self.signal == SUM:
-                rule = "the factors of a sum"
-            else:
-                rule = f'absent where signal is not "{SUM}"'
-            raise ParameterError(f"constraints.{self.name}", "terms", self.terms, rule)
+        """Raise if the signal or a term is unknown, or terms and signal do not fit together."""
+        owner = f"constraints.{self.name}"
+        if self.signal == SUM and not self.terms:
+            raise ParameterError(owner, "terms", self.terms, "the factors of a sum")
+        if self.signal != SUM and self.terms:
+            raise ParameterError(owner, "terms", self.terms, f'absent where signal is not "{SUM}"')
         if self.signal not in (*SIGNALS, SUM):
             raise UnknownNameError("signal", self.signal, [*SIGNALS, SUM])
         for name in self.terms or ():
@@ -341,20 +345,20 @@ class Limit:
     def tolerances(self) -> tuple[float, float]:
         """Violations accepted at the physics rate and at the control samples, stated or by default.
 
-        If only `tolerance` is stated, the one at the samples is in the proportion of the defaults; if only that is
-        stated, `tolerance` is at least as large.
+        If only `tolerance` is stated, the two are in the proportion of the defaults.  If only `tolerance_sampled` is
+        stated, the one at the physics rate is the default, or the stated one if that is larger.
         """
-        plant, sampled = self.source.tolerance.of(self.half_band)
-        if self.tolerance is None:
-            if self.tolerance_sampled is None:
-                return plant, sampled
-            return max(plant, self.tolerance_sampled), self.tolerance_sampled
-        if self.tolerance_sampled is not None:
+        default, default_sampled = self.source.tolerance.of(self.half_band)
+        if self.tolerance is not None and self.tolerance_sampled is not None:
             return self.tolerance, self.tolerance_sampled
-        proportion = 1.0
-        if plant:
-            proportion = sampled / plant
-        return self.tolerance, self.tolerance * proportion
+        if self.tolerance_sampled is not None:
+            return max(default, self.tolerance_sampled), self.tolerance_sampled
+        if self.tolerance is not None:
+            proportion = 1.0  # of defaults that are 0
+            if default:
+                proportion = default_sampled / default
+            return self.tolerance, self.tolerance * proportion
+        return default, default_sampled
 
     def with_tolerances(self) -> Limit:
         """Return the limit with both tolerances stated."""
@@ -363,7 +367,7 @@ class Limit:
 
     def holds_at(self, t: Array) -> Mask:
         """Return (K,) whether it applies at times (K,) [s]."""
-        return (t >= self.start - 1e-9) & (t <= self.stop + 1e-9)
+        return (t >= self.start - _TIME_ROUNDING) & (t <= self.stop + _TIME_ROUNDING)
 
     def margin(self, values: Array) -> Array:
         """Return (K,) the signed distance to the nearer bound, the smallest over rotors; negative = beyond it."""
@@ -379,7 +383,10 @@ class Limit:
             margin: signed margins, of any shape; NaN outside the time window, where the excess is NaN too.
             sampled: whether they are at the control samples; otherwise they are at the physics rate.
         """
-        return np.asarray(-self.tolerances[sampled] - np.asarray(margin, float))
+        tolerance, tolerance_sampled = self.tolerances
+        if sampled:
+            tolerance = tolerance_sampled
+        return np.asarray(-tolerance - np.asarray(margin, float))
 
     def violated(self, margin: ArrayLike, *, sampled: bool = False) -> Mask:
         """Return whether margins violate the limit; arguments as `excess`."""
@@ -421,7 +428,7 @@ class Finding:
     """
 
     limit: Limit  # the limit audited
-    peak_sampled: float  # value closest to (or furthest beyond) a bound at the control samples, of the first such bound
+    peak_sampled: float  # value at the control samples that is closest to a bound, or furthest beyond it
     peak_plant: float  # the same at the physics rate; NaN for signals that exist only at samples
     worst_margin_sampled: float  # smallest signed margin at the control samples
     worst_margin: float  # smallest signed margin at the physics rate, or at the samples if the signal exists only there
@@ -445,10 +452,9 @@ class Finding:
         if math.isnan(self.worst_time):
             return "incomplete"
         margin, tolerance = self.deciding
-        # NaN: violated
         if margin >= -tolerance:
             return "satisfied"
-        return "violated"
+        return "violated"  # also where the margin is NaN
 
     @property
     def satisfied(self) -> bool:
@@ -473,12 +479,11 @@ class Finding:
 
         It is taken at the physics rate, unless only the samples violate the limit.
         """
-        sampled = self.worst_margin_sampled
-        margin = self.worst_margin
         tolerance, tolerance_sampled = self.limit.tolerances
-        if self.limit.violated(sampled, sampled=True) and margin >= -tolerance:
-            return sampled, tolerance_sampled
-        return margin, tolerance
+        violated_at_samples = self.limit.violated(self.worst_margin_sampled, sampled=True)
+        if violated_at_samples and self.worst_margin >= -tolerance:
+            return self.worst_margin_sampled, tolerance_sampled
+        return self.worst_margin, tolerance
 
 
 def worst_finding(findings: Iterable[Finding]) -> Finding | None:
@@ -542,12 +547,16 @@ def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, fa
 
 
 _COMPARED: Final = ("signal", "terms", "lower", "upper", "start", "stop", "tolerances", "shape")
+"""Attributes that may differ between the limits of two audits."""
 
 
 def limit_differences(first: Sequence[Limit], second: Sequence[Limit], *, demands: bool = True) -> list[str]:
-    """Return, by name, how the limits of two audits differ: absent ones, bounds, windows and tolerances.
+    """Return how the limits of two audits differ, a line per difference: absent ones, bounds, windows and tolerances.
 
-    `demands`: also in which are required, on which the verdict on a flight depends.
+    Args:
+        first: limits of one audit, paired with the others by their names.
+        second: those of the other.
+        demands: whether to compare, too, which limits are required, on which the verdict on a flight depends.
     """
     compared = [*_COMPARED]
     if demands:
@@ -563,19 +572,19 @@ def limit_differences(first: Sequence[Limit], second: Sequence[Limit], *, demand
 
 
 def _field_differences(limit: Limit, other: Limit, compared: Sequence[str]) -> list[str]:
-    """Return in which of the compared fields two limits of one name differ."""
+    """Return in which of the compared attributes two limits of one name differ, a line per difference."""
     lines = []
-    for what in compared:
-        value = getattr(limit, what, None)
-        other_value = getattr(other, what, None)
+    for attribute in compared:
+        value = getattr(limit, attribute, None)
+        other_value = getattr(other, attribute, None)
         if value != other_value:
-            lines.append(f"{limit.name}: {what} {_plain(value)} and {_plain(other_value)}")
+            lines.append(f"{limit.name}: {attribute} {_shown(value)} and {_shown(other_value)}")
     return lines
 
 
-def _plain(value: object) -> str:
-    """Return a part of a limit for a message: tolerances at the physics rate and at the samples."""
-    if isinstance(value, tuple):
+def _shown(value: object) -> str:
+    """Return an attribute of a limit for a message."""
+    if isinstance(value, tuple):  # the two tolerances
         return " / ".join(f"{number:.4g}" for number in value)
     if isinstance(value, float):
         return f"{value:.6g}"
@@ -617,17 +626,21 @@ def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
 
 
 def _find(log: FlightLog, limit: Limit) -> Finding:
+    """Return the finding on a limit with stated tolerances."""
     t = log.control.t
     values = limit.source.sampled(log.control)
     sampled = _nearest(limit, t, values)
-    if t.size:  # a flight can end before its first period
+    has_periods = t.size > 0
+    if has_periods:  # a flight that ends before its first period is not judged, though the plant has a row
         t, values = limit.source.finest(log)
     finest = _nearest(limit, t, values)
-    beyond = limit.holds_at(t) & limit.violated(limit.margin(values))
-    durations = np.diff(t, append=log.plant.t[-1:])  # a value lasts until the next, or until the flight's end
     peak_plant = finest.value
     if limit.source.plant is None:
         peak_plant = math.nan
+    beyond = limit.holds_at(t) & limit.violated(limit.margin(values))
+    end = log.plant.t[-1:]
+    durations = np.diff(t, append=end)  # a value lasts until the next, or until the flight's end
+    time_violated = round(float(durations[beyond].sum()), 9)
     return Finding(
         limit=limit,
         peak_sampled=sampled.value,
@@ -635,7 +648,7 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
         worst_margin_sampled=sampled.margin,
         worst_margin=finest.margin,
         worst_time=finest.time,
-        time_violated=round(float(durations[beyond].sum()), 9) + 0.0,
+        time_violated=time_violated + 0.0,  # -0.0 becomes 0.0
     )
 
 
@@ -657,15 +670,17 @@ def _nearest(limit: Limit, t: Array, values: Array) -> _Nearest:
         inside &= np.isfinite(values)
     if not inside.any():
         return _Nearest(math.nan, math.nan, math.nan)
-    columns = values[inside].reshape(np.count_nonzero(inside), -1)
+    columns = values[inside].reshape(np.count_nonzero(inside), -1)  # one, or one per rotor
     margins = limit.margin(columns)
     smallest = margins.min()
     row = first_smallest(margins, limit.tie)
-    distances = np.stack([limit.upper - columns[row], columns[row] - limit.lower])
-    first = first_smallest([*distances.ravel(), smallest], limit.tie)  # one of the distances: some are tied with it
-    side, column = np.unravel_index(first, distances.shape)
-    if side == 0:
+    to_upper = limit.upper - columns[row]
+    to_lower = columns[row] - limit.lower
+    distances = np.concatenate([to_upper, to_lower])
+    first = first_smallest([*distances, smallest], limit.tie)  # not the last: one of the distances is tied with it
+    column = first % to_upper.size
+    if first < to_upper.size:
         value = columns[:, column].max()
     else:
         value = columns[:, column].min()
-    return _Nearest(float(value), float(smallest), float(t[inside][row]))
+    return _Nearest(value=float(value), margin=float(smallest), time=float(t[inside][row]))

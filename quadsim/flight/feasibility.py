@@ -35,7 +35,7 @@ from quadsim.vehicle import Vehicle
 
 STENCIL: Final = 2  # samples on either side that a torque depends on
 DIFFERENCE_ROUNDING: Final = 1e-6
-"""Tolerances of a bound, relative and absolute, for rounding in the differences."""
+"""Tolerance for rounding in the differences: of a bound b, this times 1 + |b|."""
 BODY_RATES: Final = ("body_rate_x", "body_rate_y", "body_rate_z")
 """Bounds on body rates, by their signals."""
 _NUMERALS: Final = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
@@ -70,7 +70,8 @@ class Feasibility:
     thrust_min: float  # least thrust of a rotor [N]; negative: not flyable, whatever the rotors' limits
     jumps: tuple[float, ...]  # times of jumps of the course [s]; the peaks exclude them
     problems: tuple[str, ...]
-    """What it needs beyond each exceeded limit, after `it needs`; empty for a course that can be flown exactly."""
+    """What the course needs beyond each exceeded limit, as phrases that continue `it needs`; empty for a course that
+    can be flown exactly."""
     sentence: str  # summary for the user
     advice: str  # the speed, response time or size that would be within limits and bounds, in a sentence
     notes: tuple[str, ...]  # what no controller can do, and doubts about the course's numbers
@@ -111,17 +112,19 @@ def demand(
     else:
         kinks = jumps | kinks
 
+    # Each difference has one row less: the course has K + 4, velocities K + 3, attitudes K + 2, rates K + 1, torques K.
     velocity = np.diff(course, axis=0) / period
-    usable = ~(jumps[1:] | jumps[:-1])
+    usable = ~(jumps[1:] | jumps[:-1])  # no jump on either side of the sample
     acceleration = np.where(usable[:, None], np.diff(velocity[:, :3], axis=0) / period, 0.0)
     specific_force = acceleration + np.array([0.0, 0.0, vehicle.gravity])
     euler = _attitudes(specific_force, course[1:-1, 3])
     euler_rates = np.diff(euler, axis=0) / period
-    body_rates = euler_to_body_rates(0.5 * (euler[1:] + euler[:-1]), euler_rates)
-    smooth = ~(kinks[3:] | kinks[2:-1] | kinks[1:-2] | kinks[:-3])
+    mean_euler = 0.5 * (euler[1:] + euler[:-1])
+    body_rates = euler_to_body_rates(mean_euler, euler_rates)
+    smooth = ~(kinks[3:] | kinks[2:-1] | kinks[1:-2] | kinks[:-3])  # no kink in the four intervals of a torque
     torque = np.where(smooth[:, None], _torques(body_rates, period, vehicle), 0.0)
 
-    inner = slice(1, -1)
+    inner = slice(1, -1)  # of K + 2 rows, those of the K samples
     thrust = vehicle.mass * np.linalg.norm(specific_force, axis=1)[inner]
     wrench = np.column_stack([thrust, torque])
     squared_speeds = np.linalg.solve(vehicle.allocation, wrench.T).T
@@ -160,25 +163,40 @@ def assess(
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
-    tilts = []
-    for name in ("roll", "pitch"):
-        if name in bounds:
-            for side in bounds[name]:
-                tilts.append(abs(side))
-    peaks = {
+    peaks = _peaks(needed, vehicle)
+    problems = _problems(needed, vehicle, bounds, tightened or {})
+    sentence = _sentence(peaks, vehicle, _narrowest_tilt(bounds), jumps, problems)
+    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence, advice="", notes=())
+
+
+def _peaks(needed: Demand, vehicle: Vehicle) -> dict[str, float]:
+    """Return the peaks of the demands, by the names and in the units of `Feasibility`."""
+    speeds = np.linalg.norm(needed.state[:, VELOCITY], axis=1)
+    accelerations = np.linalg.norm(needed.acceleration, axis=1)
+    yaws = np.abs(wrapped(needed.state[:, INDEX["yaw"]]))
+    yaw_rates = np.abs(needed.state[:, INDEX["yaw_rate"]])
+    weight = vehicle.mass * vehicle.gravity
+    return {
         "tilt": math.degrees(float(tilt(needed.state).max())),
-        "velocity": float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max()),
-        "acceleration": float(np.linalg.norm(needed.acceleration, axis=1).max()),
-        "yaw": math.degrees(float(np.abs(wrapped(needed.state[:, INDEX["yaw"]])).max())),
-        "yaw_rate": math.degrees(float(np.abs(needed.state[:, INDEX["yaw_rate"]]).max())),
+        "velocity": float(speeds.max()),
+        "acceleration": float(accelerations.max()),
+        "yaw": math.degrees(float(yaws.max())),
+        "yaw_rate": math.degrees(float(yaw_rates.max())),
         "rotor_min": float(needed.speeds.min()),
         "rotor_max": float(needed.speeds.max()),
-        "thrust_to_weight": float(needed.thrust.max()) / (vehicle.mass * vehicle.gravity),
+        "thrust_to_weight": float(needed.thrust.max()) / weight,
         "thrust_min": float(needed.thrusts.min()),
     }
-    problems = _problems(needed, vehicle, bounds, tightened or {})
-    sentence = _sentence(peaks, vehicle, min(tilts, default=None), jumps, problems)
-    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence, advice="", notes=())
+
+
+def _narrowest_tilt(bounds: Mapping[str, tuple[float, float]]) -> float | None:
+    """Return the narrowest bound on roll or pitch [deg]; None without one."""
+    magnitudes = []
+    for name in ("roll", "pitch"):
+        if name in bounds:
+            lower, upper = bounds[name]
+            magnitudes += [abs(lower), abs(upper)]
+    return min(magnitudes, default=None)
 
 
 def _attitudes(specific_force: Array, yaw: Array) -> Array:
@@ -195,8 +213,10 @@ def _attitudes(specific_force: Array, yaw: Array) -> Array:
 
 def _torques(body_rates: Array, period: float, vehicle: Vehicle) -> Array:
     """Return (M - 1, 3) tau = J d(w)/dt + w x J w [N m], of body rates w (M, 3) [rad/s] a period apart."""
-    rates = 0.5 * (body_rates[1:] + body_rates[:-1])
-    return vehicle.momentum(np.diff(body_rates, axis=0)) / period + np.cross(rates, vehicle.momentum(rates))
+    mean_rates = 0.5 * (body_rates[1:] + body_rates[:-1])
+    accelerating = vehicle.momentum(np.diff(body_rates, axis=0)) / period
+    gyroscopic = np.cross(mean_rates, vehicle.momentum(mean_rates))
+    return accelerating + gyroscopic
 
 
 def _states(course: Array, velocity: Array, euler: Array, euler_rates: Array, usable: Mask) -> Array:
@@ -207,12 +227,12 @@ def _states(course: Array, velocity: Array, euler: Array, euler_rates: Array, us
         velocity: (K + 3, 4) its differences from sample to sample, per second.
         euler: (K + 2, 3) attitudes [rad], without the first and the last sample.
         euler_rates: (K + 1, 3) their differences from sample to sample [rad/s].
-        usable: (K + 2,) whether there is no jump beside the sample; there, velocities and rates are 0.
+        usable: (K + 2,) whether there is no jump beside a sample; beside a jump, velocities and rates are 0.
     """
     inner = slice(1, -1)
     mean_velocity = 0.5 * (velocity[1:] + velocity[:-1])
     mean_rates = 0.5 * (euler_rates[1:] + euler_rates[:-1])
-    turning = usable[2:] & usable[1:-1] & usable[:-2]
+    turning = usable[2:] & usable[1:-1] & usable[:-2]  # a rate depends on three attitudes
     state = np.zeros((course.shape[0] - 2 * STENCIL, N_STATES))
     state[:, POSITION] = course[STENCIL:-STENCIL, :3]
     state[:, VELOCITY] = np.where(usable[:, None], mean_velocity[:, :3], 0.0)[inner]
@@ -227,7 +247,7 @@ def _problems(
     bounds: Mapping[str, tuple[float, float]],
     tightened: Mapping[str, tuple[float, float]],
 ) -> tuple[str, ...]:
-    """Return what is needed beyond each side of a limit or bound."""
+    """Return a phrase for each side of a limit or bound that the demands exceed; arguments as `assess`."""
     problems = _rotor_problems(needed, vehicle)
     for name, allowed in bounds.items():
         quantity, unit, values = _bounded(name, needed)
@@ -241,7 +261,7 @@ def _problems(
 
 
 def _rotor_problems(needed: Demand, vehicle: Vehicle) -> list[str]:
-    """Return what is needed of the rotors beyond their limits."""
+    """Return a phrase for each side of the rotors' limits that the demands exceed."""
     limits = (vehicle.speed_min, vehicle.speed_max)
     problems = _exceeded("rotor speed", "rad/s", needed.speeds, limits, whose="rotor ")
     lowest = float(needed.thrusts.min())
@@ -268,7 +288,7 @@ def _bounded(name: str, needed: Demand) -> tuple[str, str, Array]:
 
 
 def _narrower_than_rotors(bound: tuple[float, float], vehicle: Vehicle) -> tuple[float, float]:
-    """Return a bound on rotor speeds without the sides that the rotors' own limits, named already, make as narrow."""
+    """Return a bound on rotor speeds without the sides that are no narrower than the rotors' limits, checked before."""
     lower, upper = bound
     if lower <= vehicle.speed_min:
         lower = -math.inf
@@ -299,25 +319,31 @@ def _exceeded(
     if not values.size:
         return []
     lower, upper = allowed
+    stated_lower, stated_upper = stated or (None, None)
     highest = float(values.max())
     lowest = float(values.min())
-    beyond = []  # each with the side of the limits that it exceeds
-    if highest > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
-        beyond.append((highest, 1))
-    if lowest < lower - DIFFERENCE_ROUNDING * (1.0 + abs(lower)):
-        beyond.append((lowest, 0))
     phrases = []
-    for value, side in beyond:
-        limit = allowed[side]
-        text = f"{whose}limit {limit:.4g} {unit}"
-        if stated is not None:
-            text = f"limit {stated[side]:.4g} {unit}, tightened to {limit:.4g} {unit}"
-        phrases.append(f"{_distinct_from(limit, value)} {unit} of {quantity} ({text})")
+    if highest > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
+        limit = _limit_text(upper, unit, whose, stated_upper)
+        phrases.append(f"{_distinct_from(upper, highest)} {unit} of {quantity} ({limit})")
+    if lowest < lower - DIFFERENCE_ROUNDING * (1.0 + abs(lower)):
+        limit = _limit_text(lower, unit, whose, stated_lower)
+        phrases.append(f"{_distinct_from(lower, lowest)} {unit} of {quantity} ({limit})")
     return phrases
 
 
+def _limit_text(limit: float, unit: str, whose: str, stated: float | None) -> str:
+    """Return one side of a limit in words, with the bound that was tightened to it, if there is one."""
+    if stated is not None:
+        return f"limit {stated:.4g} {unit}, tightened to {limit:.4g} {unit}"
+    return f"{whose}limit {limit:.4g} {unit}"
+
+
 def _distinct_from(limit: float, value: float) -> str:
-    """Return a value in three digits, or in more where it has them before its point or they tell it from the limit."""
+    """Return a value as text with three significant digits, or more.
+
+    It has all digits before the decimal point, and as many as it takes to be on the right side of the limit.
+    """
     digits = 3
     if math.isfinite(value):
         digits = max(digits, len(str(round(abs(value)))))
@@ -355,12 +381,12 @@ def _sentence(
     bound = ""
     if allowed is not None:
         bound = f" (bound {allowed:.4g} deg)"
-    turned = ""
+    yaw = ""
     if peaks["yaw"] > 0.5:
-        turned = f", a yaw of {round(peaks['yaw'], 1):g} deg"
+        yaw = f", a yaw of {round(peaks['yaw'], 1):g} deg"
     return (
         f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{bound}, "
-        f"{round(peaks['velocity'], 2):g} m/s{turned}, "
+        f"{round(peaks['velocity'], 2):g} m/s{yaw}, "
         f"and rotor speeds of {peaks['rotor_min']:.4g} to {peaks['rotor_max']:.4g} rad/s "
         f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g})."
     )
@@ -373,6 +399,7 @@ def _further(count: int) -> str:
     if count == 1:
         return "; another limit is exceeded, too"
     number = str(count)
-    if count - 2 < len(_NUMERALS):
-        number = _NUMERALS[count - 2]
+    place = count - 2  # of the word for it
+    if place < len(_NUMERALS):
+        number = _NUMERALS[place]
     return f"; {number} other limits are exceeded, too"

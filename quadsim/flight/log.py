@@ -38,10 +38,10 @@ COUNT = "count"
 
 
 def columns(units: Mapping[str, str] | str = "-", *, kind: str = NUMBER, gaps: bool = False) -> dict[str, Any]:
-    """Return the metadata of a field that is written: the only statement of its columns and their units.
+    """Return the metadata of a field that is written to files: its columns, which are stated here and nowhere else.
 
     Args:
-        units: unit of each column, by the column's name; a single one for a column with the field's name.
+        units: unit of each column, by the column's name; a single unit, where the field is one column of its own name.
         kind: `NUMBER`, `TEXT` or `COUNT`.
         gaps: whether some rows may lack a value: NaN in memory, null in files.
     """
@@ -49,39 +49,46 @@ def columns(units: Mapping[str, str] | str = "-", *, kind: str = NUMBER, gaps: b
 
 
 class Columns(NamedTuple):
-    """What a field of a table states of its columns; see `columns`."""
+    """The columns of one field of a table, as its metadata states them; see `columns`."""
 
-    units: Mapping[str, str]
-    kind: str
-    gaps: bool
-    optional: bool
+    units: Mapping[str, str]  # unit of each column, by the column's name
+    kind: str  # `NUMBER`, `TEXT` or `COUNT`
+    gaps: bool  # whether some rows may lack a value
+    optional: bool  # whether the field may be None; then its columns are absent
 
 
 def columns_of(table: type[Any]) -> dict[str, Columns]:
-    """Return the columns of a table's fields, in their order, by field; those that default to None are optional."""
+    """Return the columns of a table's written fields, in order, by field; those that default to None are optional."""
     by_field = {}
-    for one in fields(table):
-        if "units" not in one.metadata:
+    for table_field in fields(table):
+        metadata = table_field.metadata
+        if "units" not in metadata:
             continue
-        units = one.metadata["units"]
+        units = metadata["units"]
         if isinstance(units, str):
-            units = {one.name: units}
-        by_field[one.name] = Columns(
-            units=units, kind=one.metadata["kind"], gaps=one.metadata["gaps"], optional=one.default is None
+            units = {table_field.name: units}
+        optional = table_field.default is None
+        by_field[table_field.name] = Columns(
+            units=units, kind=metadata["kind"], gaps=metadata["gaps"], optional=optional
         )
     return by_field
 
 
-def _numbered(name: str, unit: str) -> dict[str, str]:
+def _by_rotor(name: str, unit: str) -> dict[str, str]:
+    """Return the unit of a column per rotor, by the columns' names, e.g. `u1` .. `u4`."""
     return {f"{name}{i}": unit for i in range(1, N_ROTORS + 1)}
 
 
 def _by_axis(name: str, unit: str, axes: str = "xyz") -> dict[str, str]:
+    """Return the unit of a column per axis, by the columns' names, e.g. `wind_x`, `wind_y`, `wind_z`."""
     return {f"{name}{axis}": unit for axis in axes}
 
 
 _STATE: Final = dict(zip(STATE_NAMES, STATE_UNITS, strict=True))
+_TRUE_STATE: Final = {f"true_{name}": unit for name, unit in _STATE.items()}
 _REFERENCE: Final = {f"ref_{name}": unit for name, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)}
+_TARGET: Final = {"target_thrust": "N", **_by_axis("target_body_rate_", "rad/s")}
+_WRENCH: Final = _by_axis("force_", "N") | _by_axis("torque_", "N m")
 
 
 class LoggedSignals(dict[str, tuple[str, float]]):
@@ -92,13 +99,17 @@ class LoggedSignals(dict[str, tuple[str, float]]):
         if not isinstance(name, str) or not name.isidentifier() or name in COLUMNS:
             raise ParameterError("log", "name", name, "an identifier that is no column of flight.parquet")
         number = np.asarray(value)
-        if number.shape or number.dtype.kind not in "biuf" or np.isinf(number):
+        is_number = number.ndim == 0 and number.dtype.kind in "biuf"  # a truth value, an integer or a float
+        if not is_number or np.isinf(number):
             raise ParameterError("log", name, value, "one number, finite or NaN")
         self[name] = unit, float(number)
 
 
 def stacked(periods: Sequence[LoggedSignals]) -> dict[str, tuple[str, Array]]:
-    """Unit, of its first period, and values (K,) of each signal that K periods logged, NaN in periods without."""
+    """Return the signals that K periods logged, by name: unit, and values (K,), NaN in periods without a value.
+
+    A signal's unit is the one that it was first logged with.
+    """
     stack: dict[str, tuple[str, Array]] = {}
     for k, signals in enumerate(periods):
         for name, (unit, value) in signals.items():
@@ -110,7 +121,10 @@ def stacked(periods: Sequence[LoggedSignals]) -> dict[str, tuple[str, Array]]:
 
 
 class Sampled:
-    """What follows from states, references and commands at the control samples, whatever else is logged of them."""
+    """What follows from states, references and commands at the control samples.
+
+    `ControlLog` and `Samples` have these fields, which are described there.
+    """
 
     t: Array
     state: Array
@@ -126,22 +140,27 @@ class Sampled:
     def tracking_error(self) -> Array:
         """(K, 4) true state less reference: x, y, z [m], yaw [rad] in (-pi, pi]."""
         error = self.truth[:, REFERENCE_STATES] - self.reference
-        error[:, REFERENCE_NAMES.index("yaw")] = wrapped(error[:, REFERENCE_NAMES.index("yaw")])
+        yaw = REFERENCE_NAMES.index("yaw")
+        error[:, yaw] = wrapped(error[:, yaw])
         return error
 
     @property
     def measured_error(self) -> Array:
-        """(K, 12) measured less true state; a logged attitude gives a rotation vector and body rates, body axes.
+        """(K, 12) measured less true state.
 
-        Without one, it is the difference of Euler angles and of their rates.
+        If attitude and body rates are measured, the errors in place of Euler angles and their rates are, in body axes,
+        twice the vector part of the rotation from the true to the measured attitude, which for small errors is its
+        rotation vector [rad], and the difference of the body rates [rad/s].
         """
         error = self.state - self.truth
-        error[:, INDEX["yaw"]] = wrapped(error[:, INDEX["yaw"]])
+        yaw = INDEX["yaw"]
+        error[:, yaw] = wrapped(error[:, yaw])
         if self.attitude is not None and self.body_rates is not None:
             angles = self.truth[:, ANGLES]
             rates = self.truth[:, ANGLE_RATES]
             turn = multiply(conjugate(euler_to_quaternion(angles)), self.attitude)
-            error[:, ANGLES] = 2.0 * np.copysign(1.0, turn[:, :1]) * turn[:, 1:]
+            sign = np.copysign(1.0, turn[:, :1])  # of the two quaternions of a rotation, the one by less than 180 deg
+            error[:, ANGLES] = 2.0 * sign * turn[:, 1:]
             error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)
         return error
 
@@ -153,7 +172,7 @@ class Sampled:
 
 @dataclass(frozen=True, kw_only=True)
 class Samples(Sampled):
-    """The fields of a `ControlLog` on which signals depend: what the margins of a single period take."""
+    """The fields of a `ControlLog` that the signals of an audit are computed from: enough for a single period."""
 
     t: Array
     state: Array
@@ -173,7 +192,7 @@ class ControlLog(Sampled):
     t: Array = field(metadata=columns("s"))  # (K,)
     state: Array = field(metadata=columns(_STATE))  # (K, 12) measured state, as the controller received it
     reference: Array = field(metadata=columns(_REFERENCE))  # (K, 4) filtered, at t_k
-    speeds: Array = field(metadata=columns(_numbered("u", "rad/s")))
+    speeds: Array = field(metadata=columns(_by_rotor("u", "rad/s")))
     """(K, 4) commanded rotor speeds in force at the end of the period."""
     speeds_before: Array  # (4,) u(-1), the command before the first [rad/s]
     status: tuple[str, ...] = field(metadata=columns(kind=TEXT))
@@ -182,7 +201,7 @@ class ControlLog(Sampled):
     """K texts: `gain`, `core`, a QP solver's name, `law`, `fallback` or `stopped`."""
     phase: tuple[str, ...] = field(metadata=columns(kind=TEXT))  # K texts, see `quadsim.controller.Phase`
     iterations: Counts = field(metadata=columns(kind=COUNT))
-    """(K,), as the further fields named as those of `quadsim.controller.Statistics`."""
+    """(K,); `quadsim.controller.Statistics` defines this field, and the further ones that it names."""
     active: Counts = field(metadata=columns(kind=COUNT))
     fallback: Counts = field(metadata=columns(kind=COUNT))  # (K,) 0 none, higher = deeper
     slack: Array = field(metadata=columns("rad"))
@@ -193,21 +212,19 @@ class ControlLog(Sampled):
     kkt_complementarity: Array = field(metadata=columns(gaps=True))
     kkt_dual: Array = field(metadata=columns(gaps=True))
     delay: Array = field(metadata=columns("s"))  # (K,) simulated time from the measurement to the command
-    truth: Array = field(metadata=columns({f"true_{name}": unit for name, unit in _STATE.items()}))
+    truth: Array = field(metadata=columns(_TRUE_STATE))
     """(K, 12) true state; not written where it equals the measured one."""
     attitude: Array | None = field(default=None, metadata=columns(_by_axis("q", "-", "wxyz")))
     """(K, 4) measured quaternion, sign continuous; None if Euler angles suffice."""
     body_rates: Array | None = field(default=None, metadata=columns(_by_axis("body_rate_", "rad/s")))
     """(K, 3) measured body rates; None if Euler angles suffice."""
     sqp: Array | None = field(default=None, metadata=columns({"sqp_defect": "-", "sqp_step": "-"}, gaps=True))
-    """(K, 2) of `quadsim.controller.Statistics`, NaN in periods without; None if all are."""
-    target: Array | None = field(
-        default=None, metadata=columns({"target_thrust": "N", **_by_axis("target_body_rate_", "rad/s")}, gaps=True)
-    )
+    """(K, 2) of `quadsim.controller.Statistics`, NaN in periods without; None if no period has them."""
+    target: Array | None = field(default=None, metadata=columns(_TARGET, gaps=True))
     """(K, 4) collective thrust and body rates that the autopilot is to fly, NaN in periods without; None without an
     autopilot."""
     target_attitude: Array | None = field(default=None, metadata=columns(_by_axis("target_q", "-", "wxyz"), gaps=True))
-    """(K, 4) attitude that it is to hold; None if it holds none."""
+    """(K, 4) attitude, as a quaternion, that the autopilot is to hold; None if it holds none."""
     logged: Mapping[str, tuple[str, Array]] = field(default_factory=dict)
     """What the controller logged, by name: unit and values (K,), NaN in periods without."""
 
@@ -222,11 +239,11 @@ class ControlLog(Sampled):
         return str(Phase.CRASHED) in self.phase
 
 
-_OF_FIELDS: Final = columns_of(ControlLog)
-COLUMNS: Final = frozenset(name for columns in _OF_FIELDS.values() for name in columns.units)
+_CONTROL_COLUMNS: Final = columns_of(ControlLog)
+COLUMNS: Final = frozenset(name for stated in _CONTROL_COLUMNS.values() for name in stated.units)
 """The columns of flight.parquet, but for those that a controller logs."""
-RESIDUALS: Final = tuple(name for name, columns in _OF_FIELDS.items() if columns.gaps and not columns.optional)
-"""Fields that every flight has, with gaps."""
+RESIDUALS: Final = tuple(name for name, stated in _CONTROL_COLUMNS.items() if stated.gaps and not stated.optional)
+"""Fields of the residuals of a solution; each flight has them, NaN in periods where they are not available."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,14 +261,14 @@ class PlantLog:
 
     t: Array = field(metadata=columns("s"))  # (M,)
     state: Array = field(metadata=columns(_STATE))  # (M, 12) true state, yaw unwrapped
-    speeds: Array = field(metadata=columns(_numbered("w", "rad/s")))
-    """(M, 4) rotor speeds from t on; rotors that lag pass through them."""
-    wrench: Array | None = field(default=None, metadata=columns(_by_axis("force_", "N") | _by_axis("torque_", "N m")))
+    speeds: Array = field(metadata=columns(_by_rotor("w", "rad/s")))
+    """(M, 4) rotor speeds of the physics step from t on; of rotors that lag, those at t."""
+    wrench: Array | None = field(default=None, metadata=columns(_WRENCH))
     """(M, 6) external force, world, and torque, body frame, from t on; None if there is none."""
     wind: Array | None = field(default=None, metadata=columns(_by_axis("wind_", "m/s")))
     """(M, 3) velocity of the air, world; None without wind."""
     battery: Array | None = field(default=None, metadata=columns({"voltage": "V", "charge": "-"}))
-    """(M, 2) of the step from t on; None without a battery."""
+    """(M, 2) voltage and charge of the physics step from t on; None without a battery."""
     attitude: Array | None = field(default=None, metadata=columns(_by_axis("q", "-", "wxyz")))
     """(M, 4) true quaternion, body to world; None if Euler angles suffice."""
     body_rates: Array | None = field(default=None, metadata=columns(_by_axis("body_rate_", "rad/s")))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -33,65 +33,79 @@ from quadsim.input_limits import LARGEST_TABLE, LARGEST_TEXTS, MOST_COLUMNS, MOS
 from quadsim.state import Array
 
 FORMAT: Final = 2
-"""Version of the files of runs and campaigns; to be raised when a file of another one would be misread."""
+"""Version of the files of runs and campaigns; to be raised when a file of an earlier version would be misread."""
 FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
-_Column = tuple[str, str, bool, pa.Array]
-"""Name and unit of a column, whether it may have gaps, and its values."""
+
+
+class _Column(NamedTuple):
+    """A column of a table that is to be written."""
+
+    name: str
+    unit: str
+    gaps: bool  # whether some rows may lack a value
+    values: pa.Array
 
 
 def _columns(log: ControlLog | TimingLog | PlantLog, *, without: str = "") -> Iterator[_Column]:
-    """The columns of a log's fields, but for absent fields and the one named `without`."""
-    for name, stated in columns_of(type(log)).items():
-        rows = getattr(log, name)
-        if rows is None or name == without:
+    """The columns of a log's fields, but for fields that are None and the one named `without`."""
+    for field_name, stated in columns_of(type(log)).items():
+        rows = getattr(log, field_name)
+        if rows is None or field_name == without:
             continue
         if len(stated.units) == 1:
-            values = [rows]
+            by_column = [rows]
         else:
-            values = rows.T
-        kind = None
+            by_column = rows.T
+        arrow_type = None  # that of the values
         if stated.kind == TEXT:
-            kind = pa.string()
-        for (column, unit), entries in zip(stated.units.items(), values, strict=True):
-            yield column, unit, stated.gaps, pa.array(entries, kind, from_pandas=stated.gaps)
+            arrow_type = pa.string()
+        for (name, unit), entries in zip(stated.units.items(), by_column, strict=True):
+            values = pa.array(entries, arrow_type, from_pandas=stated.gaps)
+            yield _Column(name=name, unit=unit, gaps=stated.gaps, values=values)
 
 
 def _logged(log: ControlLog) -> Iterator[_Column]:
     """The columns that the controller logged."""
     for name, (unit, values) in log.logged.items():
         array = pa.array(values, from_pandas=True)
-        yield name, unit, array.null_count > 0, array
+        yield _Column(name=name, unit=unit, gaps=array.null_count > 0, values=array)
 
 
 def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
+    """Return a table of the columns; its schema has their units and gaps, the `metadata`, and the format."""
     arrays = []
-    schema = []
-    for name, unit, gaps, array in columns:
-        arrays.append(array)
-        schema.append(pa.field(name, array.type, nullable=gaps, metadata={"unit": unit}))
-    return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata={**metadata, "format": str(FORMAT)}))
+    fields = []
+    for column in columns:
+        arrays.append(column.values)
+        fields.append(pa.field(column.name, column.values.type, nullable=column.gaps, metadata={"unit": column.unit}))
+    schema = pa.schema(fields, metadata={**metadata, "format": str(FORMAT)})
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def require_format(found: object, path: Path, again: str) -> None:
-    """Refuse a file of another version of quadsim; `again` is the command that makes it anew.
+def require_format(stated: object, path: Path, again: str) -> None:
+    """Refuse a file of another version of quadsim.
+
+    Args:
+        stated: the format that the file states; None if it states none.
+        path: of the file.
+        again: the command that makes the file anew.
 
     Raises:
-        FileError: its format is not `FORMAT`.
+        FileError: the format is not `FORMAT`.
     """
-    if str(found) != str(FORMAT):
-        if found is None:
-            was = "an unnumbered format"
-        else:
-            was = f"format {str(found)[:20]!r}"
-        problem = f"was made by another version of quadsim ({was}, this one has {FORMAT}); fly it again: {again}"
-        raise FileError(path, problem)
+    if str(stated) == str(FORMAT):
+        return
+    difference = f"format {str(stated)[:20]!r}, this one has {FORMAT}"
+    if stated is None:
+        difference = f"an unnumbered format, this one has {FORMAT}"
+    raise FileError(path, f"was made by another version of quadsim ({difference}); fly it again: {again}")
 
 
 def format_of(table: pa.Table) -> str | None:
-    """The format that a table states."""
+    """The format that a table states; None if it states none."""
     stated: bytes | None = (table.schema.metadata or {}).get(b"format")
     if stated is None:
         return None
@@ -103,7 +117,7 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
     control = log.control
     left_out = ""
     if control.measured_perfectly:
-        left_out = "truth"
+        left_out = "truth"  # it equals the measured state, which is written
     speeds_before = ",".join(repr(float(speed)) for speed in control.speeds_before)
     flight_columns = [*_columns(control, without=left_out), *_logged(control)]
     tables = {
@@ -118,11 +132,11 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
 
 def _predicted_columns(t: Array, predicted: PredictedPositions) -> Iterator[_Column]:
     """The columns of the positions (K, N, 3) [m] that were predicted at times (K,) [s]; each row has N per axis."""
-    yield "t", "s", False, pa.array(t)
+    yield _Column(name="t", unit="s", gaps=False, values=pa.array(t))
     horizon = predicted.shape[1]
     for i, axis in enumerate("xyz"):
         positions = pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon)
-        yield f"predicted_{axis}", "m", False, positions
+        yield _Column(name=f"predicted_{axis}", unit="m", gaps=False, values=positions)
 
 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
@@ -157,63 +171,73 @@ def read_parquet(path: Path) -> pa.Table:
 
 
 def _read_bounded(path: Path, file: pq.ParquetFile) -> pa.Table:
-    """Read a table that fits in memory: a few bytes of a file may stand for any number of equal values.
+    """Read a table that fits in memory.
 
-    Numbers are counted before they are read. Texts that occur once in the file may occur in each row: where these might
-    not fit, they are read in batches.
+    A file of a few bytes may hold any number of equal values.  Its numbers are therefore counted before they are read.
+    A text that the file stores once may occur in each row: only a table that fits even then is read as a whole, another
+    one in batches, until it is too large.
     """
     rows = file.metadata.num_rows
     columns = file.metadata.num_columns
     if rows > MOST_ROWS or columns > MOST_COLUMNS:
         raise FileError(path, f"must have at most {MOST_ROWS} rows and {MOST_COLUMNS} columns; got {rows}, {columns}")
-    numbers, texts = _sizes(file.metadata)
-    if numbers <= LARGEST_TABLE:
-        if rows * texts <= LARGEST_TEXTS:
-            return file.read(use_threads=False)
-        table = _read_in_batches(file, texts, numbers + LARGEST_TEXTS)
-        if table is not None:
-            return table
     largest = f"{LARGEST_TABLE} bytes of numbers and {LARGEST_TEXTS} of texts"
-    raise FileError(path, f"must be of at most {largest} in memory; it has more")
+    too_large = FileError(path, f"must be of at most {largest} in memory; it has more")
+    numbers, texts = _sizes(file.metadata)
+    if numbers > LARGEST_TABLE:
+        raise too_large
+    if rows * texts <= LARGEST_TEXTS:
+        return file.read(use_threads=False)
+    table = _read_in_batches(file, texts, numbers + LARGEST_TEXTS)
+    if table is None:
+        raise too_large
+    return table
 
 
 def _sizes(metadata: pq.FileMetaData) -> tuple[int, int]:
-    """Return the bytes of all numbers of a file in memory, and of its texts as the file has them."""
+    """Return the bytes of all numbers of a file in memory, and of its texts as the file stores them."""
     numbers = 0
     texts = 0
     for i in range(metadata.num_row_groups):
         group = metadata.row_group(i)
         for j in range(metadata.num_columns):
             chunk = group.column(j)
-            numbers += 8 * chunk.num_values
+            numbers += 8 * chunk.num_values  # the widest number has 8 bytes
             if chunk.physical_type.endswith("BYTE_ARRAY"):
                 texts += chunk.total_uncompressed_size
     return numbers, texts
 
 
 def _read_in_batches(file: pq.ParquetFile, texts: int, most: int) -> pa.Table | None:
-    """Read a table in batches so small that each fits, even with every text in each row; None if the table does not.
+    """Read a table in batches that fit even with every text in each row; return None if the table does not fit.
 
     Args:
-        file: has at least one text.
-        texts: bytes of its texts as the file has them.
+        file: of the table.
+        texts: bytes of its texts in the file, at least 1.
         most: bytes that the table may have in memory.
     """
+    batch_bytes = LARGEST_TEXTS // 16
+    rows_per_batch = max(1, batch_bytes // texts)
     batches = []
-    for batch in file.iter_batches(max(1, LARGEST_TEXTS // 16 // max(1, texts)), use_threads=False):
+    remaining = most
+    for batch in file.iter_batches(rows_per_batch, use_threads=False):
         batches.append(batch)
-        most -= batch.nbytes
-        if most < 0:
+        remaining -= batch.nbytes
+        if remaining < 0:
             return None
     return pa.Table.from_batches(batches, file.schema_arrow)
 
 
 def _fields(table: pa.Table, log: type[Any], *, optional: str = "") -> dict[str, Any]:
-    """The fields of a log by name; None for those that its table may lack and does, `optional` among them."""
+    """Return the fields of a log, by name, as its table has them.
+
+    A field that is optional in the log, and the one named `optional`, is None if the table lacks its columns.
+    """
     values: dict[str, Any] = {}
     for name, stated in columns_of(log).items():
-        may_lack = stated.optional or name == optional
-        if may_lack and not set(stated.units) <= set(table.column_names):
+        may_be_absent = stated.optional or name == optional
+        is_complete = set(stated.units) <= set(table.column_names)
+        if may_be_absent and not is_complete:
             values[name] = None
             continue
         columns = [_values(table, column, stated) for column in stated.units]
@@ -225,6 +249,11 @@ def _fields(table: pa.Table, log: type[Any], *, optional: str = "") -> dict[str,
 
 
 def _values(table: pa.Table, name: str, stated: Columns) -> Any:
+    """Return a column's values: a tuple of texts, or an array of numbers, NaN where one is missing.
+
+    Raises:
+        ValueError: it is not what its field states.
+    """
     column = table.column(name)
     if stated.kind == TEXT:
         texts = tuple(column.to_pylist())
@@ -239,7 +268,11 @@ def _values(table: pa.Table, name: str, stated: Columns) -> Any:
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
-    """Read a flight back from its run directory, the plant's rows at the log rate; its summary has the `reason`.
+    """Read a flight back from its run directory, the plant's rows at the log rate.
+
+    Args:
+        directory: of the run.
+        reason: why the flight ended early, as its summary states it.
 
     Raises:
         FileError: a file is missing or damaged.
@@ -285,10 +318,10 @@ def _require_consistent(log: FlightLog) -> None:
     Raises:
         ValueError: saying which of these it is.
     """
-    periods = {log.control.t.size, log.timing.t.size}
+    lengths = {log.control.t.size, log.timing.t.size}
     if log.predicted is not None:
-        periods.add(len(log.predicted))
-    if len(periods) > 1 or not log.plant.t.size:
+        lengths.add(len(log.predicted))
+    if len(lengths) > 1 or not log.plant.t.size:
         raise ValueError("its tables are empty or differ in length")
     for t in (log.control.t, log.plant.t):
         if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():

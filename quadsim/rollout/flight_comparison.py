@@ -170,7 +170,6 @@ def compare_flights(
         OutputError: the directory, or a film that is requested, cannot be written.
         RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
-    from quadsim.console.console import short_path
     from quadsim.report.comparison_page import write_comparison
 
     judge = None  # place of the flight against whose constraints all are audited
@@ -192,14 +191,8 @@ def compare_flights(
             if flown is not None:
                 flown(comparison)
             unfilmed = _unfilmed(comparison.flights, beside, products.get("video"))
-            if not unfilmed:
-                return comparison
-            note = f"the page without them: {short_path(page)}"
-            filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
-            write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=True)
-            if products.get("video"):
-                for flight in filmed:
-                    require_product(flight, VIDEO_FILE)
+            if unfilmed:
+                _film(unfilmed, comparison, out, required=bool(products.get("video")), progress=progress, fps=fps)
             return comparison
 
 
@@ -230,6 +223,39 @@ def _compared(
     notes = (*controller_differences(controllers, names), *audit_notes)
     progress("comparison", 0, 1)
     return FlightComparison(flights=flights, rows=comparison_rows(flights), names=names, notes=notes, page=None)
+
+
+def _film(
+    unfilmed: Sequence[Flight],
+    comparison: FlightComparison,
+    out: Path,
+    *,
+    required: bool,
+    progress: Progress,
+    fps: int | None,
+) -> None:
+    """Film flights of a comparison, and write its page again with their films.
+
+    Args:
+        unfilmed: the flights.
+        comparison: they are part of it.
+        out: directory of its page, which has been written without the films.
+        required: whether a film that cannot be made is an error.
+        progress: of the films.
+        fps: frames per second.
+
+    Raises:
+        OutputError: a film that is required cannot be made; the page is written.
+    """
+    from quadsim.console.console import short_path
+    from quadsim.report.comparison_page import write_comparison
+
+    note = f"the page without them: {short_path(comparison.page or out)}"
+    filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
+    write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=True)
+    if required:
+        for flight in filmed:
+            require_product(flight, VIDEO_FILE)
 
 
 def _unfilmed(flights: Sequence[Flight], beside: Path, video: bool | None) -> list[Flight]:

@@ -1,7 +1,7 @@
 """A flown scenario in memory: named arrays, numbers, pictures, and its run directory.
 
-The end of a flight: `Flight` joins scenario, log and audit findings.  Text, JSON, tables, figures and films are made of
-it, and of nothing that was written.  Tables and summary are written first, then recording, figures and film.
+A `Flight` joins scenario, log and findings of the audit.  Text, JSON, tables, figures and films are made of this
+object, never of files.  Tables and summary are written first, then recording, figures and film.
 """
 
 from __future__ import annotations
@@ -67,8 +67,10 @@ if TYPE_CHECKING:
 
 _log: Final = logging.getLogger("quadsim")
 _PRODUCTS: Final = {rundir.RECORDING_FILE: "recording", rundir.FIGURES_DIR: "figures", rundir.VIDEO_FILE: "video"}
+"""Options of `Flight.save`, by the names of the products in a run directory."""
 INTERRUPTED: Final = "interrupted (Ctrl-C)"
-MADE: Final = "made"  # of a product in a summary; a text says why another one is not there
+MADE: Final = "made"
+"""State of a product in a summary; that of a product that is not there says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +79,8 @@ class Check:
 
     notes: tuple[str, ...] = ()  # remarks for the user that are not errors
     again: tuple[Finding, ...] | None = None
-    """The audit from the tables of a run, at the control samples and at the log rate; None of a flight that was flown
-    to be checked."""
+    """The audit from a run's tables, at the control samples and at the log rate; None if the flight was not read from a
+    run, but flown for the check."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -99,12 +101,13 @@ class Flight(Result):
         simulate_s: wall time of the closed loop alone [s].
         tallies: counts of each sensor's samples in the estimator; empty without one.
         directory: where it was read from or written to; None if it is only in memory.
-        label: its name in comparisons and legends; None for that of its scenario, and what tells its flights apart.
+        label: its name in comparisons and legends; None for the scenario's name, and what tells it from other flights
+            of the scenario.
         recorded: `summary.json` as it was read or written; None for a flight that is only in memory.
         thinned: whether `plant` has the rows at the scenario's `log_rate` alone, as files have them.
         checked: what `quadsim check` adds; None for a flight that was not checked.
         infeasible_period: the first period whose QP had no answer; None if there is none, or the flight was read.
-        own_code: whether a controller, force or autopilot flew that was passed in, which the scenario cannot repeat.
+        own_code: whether a controller, force or autopilot was passed in, so that the scenario cannot repeat the flight.
         try_remedies: flies what the explanation of a failure suggests, see `quadsim.rollout.remedies.tried`; None for a
             flight that was read.
 
@@ -161,11 +164,11 @@ class Flight(Result):
     def __repr__(self) -> str:
         flown = f"{self.log.control.t.size * self.scenario.control_period:.2f} s"
         if self.recorded is None:
-            end = self.assembly.course_cut
+            course_end = self.assembly.course_cut
         else:
-            end = self.recorded.get("course", {}).get("cut_before")
-        if end is not None:
-            flown += f" of a course that ends at {end:g} s"
+            course_end = self.recorded.get("course", {}).get("cut_before")
+        if course_end is not None:
+            flown += f" of a course that ends at {course_end:g} s"
         line = f"<Flight {self.scenario.name}: {self.outcome}, {flown} by {self.controller}"
         if self.reason:
             line += f", {self.reason}"
@@ -187,9 +190,9 @@ class Flight(Result):
 
     @cached_property
     def departure(self) -> Departure | None:
-        """How the flight ended beside its course; None where it ended on the ground, too early, or was not looked at.
+        """How far from its course the flight ended; None where it ended on the ground, or too early to tell.
 
-        A run of a version that did not look at it keeps its verdict.
+        It is also None for a run of a version that did not compute it: such a run keeps its verdict.
         """
         if self.recorded is None:
             numbers = departure_numbers(self.log.control)
@@ -206,11 +209,13 @@ class Flight(Result):
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
-        """Why the first QP without an answer had none, and what helps; None if all QPs had one.
+        """Why the flight failed, and what helps; None if there is nothing to explain.
 
-        If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any; if the
-        flight was lost, what the model lacks.  What is advised has been flown, in
-        `quadsim.rollout.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
+        It explains the first QP that had no answer.  If all QPs had one, it explains the first SQP that did not
+        converge, where a constraint does not hold, or else what the model lacks, where the flight was lost.
+
+        The changes that it advises are flown first, in `quadsim.rollout.remedies.MOST_FLOWN` flights at most: the first
+        access takes seconds.
 
         `sentence` and `advice` are for users; `docs/audit.md` explains the other entries.
         """
@@ -226,16 +231,17 @@ class Flight(Result):
             return self.recorded.get("diagnosis")
         from quadsim.rollout.infeasibility import diagnose, lacking_report
 
-        if self.infeasible_period is None:
-            flew_its_law = self.scenario.controller_at(self.end) == self.scenario.controller and not self.own_code
-            if self.outcome == "lost" and flew_its_law:
+        period = self.infeasible_period
+        if period is None:
+            kept_controller = self.scenario.controller_at(self.end) == self.scenario.controller
+            if self.outcome == "lost" and kept_controller and not self.own_code:
                 return lacking_report(self.assembly, self.end)
             return None
-        if self.infeasible_period.status == NOT_CONVERGED and self.satisfied:
+        if period.status == NOT_CONVERGED and self.satisfied:
             return None
-        spec = self.scenario.controller_at(self.infeasible_period.time)
-        scenario = self.scenario.altered(controller=spec, events=())
-        return diagnose(self.infeasible_period, scenario, self.vehicle, self.log.control.status)
+        controller = self.scenario.controller_at(period.time)
+        scenario = self.scenario.altered(controller=controller, events=())
+        return diagnose(period, scenario, self.vehicle, self.log.control.status)
 
     @property
     def limits(self) -> tuple[Limit, ...]:
@@ -293,8 +299,10 @@ class Flight(Result):
     def plant(self) -> dict[str, Array]:
         """(M,) of the time `t` [s], each true state, and rotor speeds `w1` .. `w4` [rad/s], between commands."""
         log = self.log.plant
-        speeds = dict(zip(columns_of(PlantLog)["speeds"].units, log.speeds.T, strict=True))
-        return {"t": log.t, **dict(zip(STATE_NAMES, log.state.T, strict=True)), **speeds}
+        states = dict(zip(STATE_NAMES, log.state.T, strict=True))
+        speed_names = columns_of(PlantLog)["speeds"].units
+        speeds = dict(zip(speed_names, log.speeds.T, strict=True))
+        return {"t": log.t, **states, **speeds}
 
     @cached_property
     def margins(self) -> dict[str, Array]:
@@ -305,16 +313,17 @@ class Flight(Result):
         """
         plant = self.log.plant
         t = self.time
-        starts = np.minimum(np.searchsorted(plant.t, t - 1e-9), max(plant.t.size - 1, 0))
+        last_row = max(plant.t.size - 1, 0)
+        first_rows = np.searchsorted(plant.t, t - 1e-9)  # of each period; the two times may differ by rounding
+        first_rows = np.minimum(first_rows, last_row)
         margins: dict[str, Array] = {}
-        for finding in self.findings:
-            limit = finding.limit
-            signal = finding.limit.source
+        for limit in self.limits:
+            signal = limit.source
             if signal.plant is None or not t.size:
                 margins[limit.name] = margins_sampled(limit, self.log)
             else:
-                between = margins_at(limit, plant.t, signal.plant(plant))
-                margins[limit.name] = np.fmin.reduceat(between, starts)
+                at_rows = margins_at(limit, plant.t, signal.plant(plant))
+                margins[limit.name] = np.fmin.reduceat(at_rows, first_rows)
         return margins
 
     @cached_property
@@ -324,7 +333,7 @@ class Flight(Result):
 
     @cached_property
     def numbers(self) -> Mapping[str, Any]:
-        """`summary` before a change that its diagnosis advises is flown."""
+        """`summary`, with the diagnosis as it is before the changes that it advises are flown."""
         if self.recorded is None:
             return summarise(self)
         return self.recorded
@@ -348,7 +357,7 @@ class Flight(Result):
         return replace(self, label=label)
 
     def as_stored(self) -> Flight:
-        """Return the flight with the plant's rows that its files have; numbers and audit are those of all rows."""
+        """Return the flight with the plant's rows that its files have; numbers and audit remain those of all rows."""
         if self.thinned:
             return self
         plant = self.log.plant.every(self.scenario.plant_stride)
@@ -376,7 +385,7 @@ class Flight(Result):
         return tables[table]
 
     def to_pandas(self, table: str = "flight") -> Any:
-        """The same as a pandas DataFrame.
+        """A table of the flight as a pandas DataFrame; the table's name as in `to_arrow`.
 
         Raises:
             MissingPackageError: pandas is not installed.
@@ -464,39 +473,46 @@ class Flight(Result):
         """Write the run directory without figures, recording and video; errors as `save`.
 
         Returns:
-            The flight as it was written, and whether products may follow: Ctrl-C here is heeded, but loses no flight.
+            The flight as it was written, and whether products may follow: not after Ctrl-C, which loses no flight, as
+            tables that it interrupts are written again.
         """
-        started = clock.perf_counter() - self.simulate_s
+        started = clock.perf_counter() - self.simulate_s  # the total includes the closed loop
         target = absolute(directory)
-
-        def write(*, overwrite: bool) -> Flight:
-            with writing(target, overwrite=overwrite) as partial:
-                (partial / rundir.SCENARIO_FILE).write_text(self.to_toml(), encoding="utf-8")
-                course = self.scenario.reference
-                if isinstance(course, Csv) and course.content is not None:
-                    (partial / course.file).write_bytes(course.content)
-                write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
-                wall_s = {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
-                summary = {**self.numbers, "wall_s": wall_s, "products": {}, "files": file_hashes(partial)}
-                (partial / rundir.SUMMARY_FILE).write_text(to_json(summary), encoding="utf-8")
-            return replace(self, directory=target, recorded=summary)
-
         try:
-            written = write(overwrite=overwrite)
+            written = self._write_files(target, started, overwrite=overwrite)
         except KeyboardInterrupt:
-            return write(overwrite=True), False
+            return self._write_files(target, started, overwrite=True), False
         try:
             current_hold().release()
-            if self._explanation is not None:
-                diagnosis = self.diagnosis  # which flies the changes that it advises
-                amend(target, {"diagnosis": diagnosis})
-                return written._recording(diagnosis=diagnosis), True
+            if self._explanation is None:
+                return written, True
+            diagnosis = self.diagnosis  # it flies the changes that it advises
+            amend(target, {"diagnosis": diagnosis})
+            return written._with_entries(diagnosis=diagnosis), True
         except KeyboardInterrupt:
             return written, False
-        return written, True
 
-    def _recording(self, **entries: Any) -> Flight:
-        """Return the flight with other entries of its summary."""
+    def _write_files(self, target: Path, started: float, *, overwrite: bool) -> Flight:
+        """Write scenario, course, tables and summary; return the flight as it was written.
+
+        Args:
+            target: run directory.
+            started: reading of the clock at the start of the flight [s].
+            overwrite: whether to replace an earlier output.
+        """
+        with writing(target, overwrite=overwrite) as partial:
+            (partial / rundir.SCENARIO_FILE).write_text(self.to_toml(), encoding="utf-8")
+            course = self.scenario.reference
+            if isinstance(course, Csv) and course.content is not None:
+                (partial / course.file).write_bytes(course.content)
+            write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
+            wall_s = {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
+            summary = {**self.numbers, "wall_s": wall_s, "products": {}, "files": file_hashes(partial)}
+            (partial / rundir.SUMMARY_FILE).write_text(to_json(summary), encoding="utf-8")
+        return replace(self, directory=target, recorded=summary)
+
+    def _with_entries(self, **entries: Any) -> Flight:
+        """Return the flight with these entries in its summary, in place of earlier ones."""
         return replace(self, recorded={**self.numbers, **entries})
 
     @property
@@ -603,7 +619,7 @@ def to_pandas(table: pa.Table) -> Any:
 
 
 def worst_margin(findings: Iterable[Finding]) -> str:
-    """The worst margin, see `worst_finding`, as the second line of a repr."""
+    """The worst margin, see `worst_finding`, as a further line of a repr; empty if no finding counts."""
     from quadsim.report.comparison_rows import tolerance_text
 
     worst = worst_finding(findings)
@@ -634,7 +650,8 @@ def write_run(
             flight = add_products(flight, products, fps=fps, progress=report)
             _require_products(flight, products)
         except OutputError as error:
-            if error.path.parent == flight.directory:  # a product that was requested explicitly
+            is_requested_product = error.path.parent == flight.directory
+            if is_requested_product:  # the flight is complete without it, and is shown before the error
                 error.result = flight
             raise
     return flight
@@ -651,21 +668,19 @@ def require_film(video: bool | None, fps: int | None = None) -> None:
         return
     from quadsim.report.film.video import frame_rate, rendering_backend
 
-    frame_rate(0.0, fps)
+    frame_rate(0.0, fps)  # raises if `fps` is out of range
     if video:
-        rendering_backend()
+        rendering_backend()  # raises if there is none
 
 
 def summarise(flight: Flight) -> dict[str, Any]:
     """Return `summary.json` of a flight, without the hashes of its files and the total wall time."""
     scenario = flight.scenario
     log = flight.log
-    steps = flight.assembly.course_steps
-    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
+    deadline_ms = 1e3 * scenario.control_period
+    numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=flight.assembly.course_steps)
     summary = _outcome_entries(flight)
-    summary["course"] = asdict(report(flight.assembly))
-    if flight.assembly.course_cut is not None:
-        summary["course"]["cut_before"] = flight.assembly.course_cut
+    summary["course"] = _course_entry(flight)
     events = story(scenario, log.control.t.size * scenario.control_period)
     if events:
         summary["events"] = events
@@ -675,14 +690,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
     summary |= _model_entries(flight)
     summary["control"] = numbers["control"]
     summary["diagnosis"] = flight._explanation
-    summary["controller"] = {
-        "name": flight.controller,
-        "solver": flight.solver,
-        "horizon": scenario.controller.horizon,
-        **numbers["controller"],
-    }
-    if log.control.target is not None:
-        summary["controller"]["autopilot"] = flight.assembly.autopilot_flown
+    summary["controller"] = _controller_entry(flight, numbers["controller"])
     summary |= _entries_of_parts(flight)
     summary["vehicle"] = asdict(flight.vehicle)
     if flight.actual != flight.vehicle:
@@ -708,10 +716,12 @@ def _outcome_entries(flight: Flight) -> dict[str, Any]:
     }
     if log.traceback:
         entries["traceback"] = [*log.traceback]
-    entries["lost"] = log.lost
-    if log.reason is None and flight.reason is not None:
-        entries["lost"] = DEPARTURE
+    lost = log.lost
+    flown_to_its_end = log.reason is None
+    if flown_to_its_end and flight.reason is not None:
+        lost = DEPARTURE
     return entries | {
+        "lost": lost,
         "satisfied": flight.satisfied,
         "verdict": flight.outcome,
         "group": scenario.group,
@@ -722,18 +732,40 @@ def _outcome_entries(flight: Flight) -> dict[str, Any]:
     }
 
 
+def _course_entry(flight: Flight) -> dict[str, Any]:
+    """Return the entry on the course: its demands, and where it ends early, if it does."""
+    entry = asdict(report(flight.assembly))
+    if flight.assembly.course_cut is not None:
+        entry["cut_before"] = flight.assembly.course_cut
+    return entry
+
+
+def _controller_entry(flight: Flight, numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry on the controller: what it is, its numbers over the flight, and the autopilot below it."""
+    entry = {
+        "name": flight.controller,
+        "solver": flight.solver,
+        "horizon": flight.scenario.controller.horizon,
+        **numbers,
+    }
+    if flight.log.control.target is not None:
+        entry["autopilot"] = flight.assembly.autopilot_flown
+    return entry
+
+
 def _model_entries(flight: Flight) -> dict[str, Any]:
     """Return the entries on the controller's model, if any: what it lacks of the flight, and what it gets wrong."""
-    stated = flight.scenario.controller.type
+    stated_type = flight.scenario.controller.type
     entries: dict[str, Any] = {}
     notes = implausible(flight.actual)
-    if flight.controller == stated:
+    if flight.controller == stated_type:
         notes += model_notes(flight.assembly)
     if notes:
         entries["model_notes"] = notes
-    owner = f"the model of {flight.controller}"
-    if flight.own_code or is_plugin(stated):
+    if flight.own_code or is_plugin(stated_type):
         owner = "your model"
+    else:
+        owner = f"the model of {flight.controller}"
     model_error = model_report(flight.log.control, flight.log.foreseen, owner)
     if model_error is not None:
         entries["model_error"] = model_error
@@ -761,7 +793,8 @@ def add_products(
 ) -> Flight:
     """Add recording, figures and video to the directory of a flight that was written; return it with them.
 
-    Ctrl-C stops the current one and skips the rest.  What fails is recorded, with the reason.
+    Ctrl-C stops the current one and skips the rest.  What fails is recorded, with the reason.  Products that are
+    `requested` as False are left out.
     """
     from quadsim.console.console import short_path
 
@@ -771,16 +804,18 @@ def add_products(
     if requested["recording"] is not False:
         _add_recording(products, shown, progress)
     has_periods = bool(flight.time.size)
-    if requested["figures"] is not False and has_periods and not products.interrupted:
+    figures = requested["figures"] is not False and has_periods
+    if figures and not products.interrupted:
         _add_figures(products, shown, progress)
     flight = products.recorded()
-    if requested["video"] is not False and has_periods and not (flight.log.interrupted or products.interrupted):
+    video = requested["video"] is not False and has_periods and not flight.log.interrupted
+    if video and not products.interrupted:
         note = f"all else is in {short_path(products.directory)}"
         (flight,) = add_films([flight], note=note, progress=progress, fps=fps)
     before = flight.numbers["wall_s"]
     wall_s = {**before, "total": before["total"] + clock.perf_counter() - started}
     amend(products.directory, {"wall_s": wall_s})
-    return flight._recording(wall_s=wall_s)
+    return flight._with_entries(wall_s=wall_s)
 
 
 def _add_recording(products: _Products, flight: Flight, progress: Progress) -> None:
@@ -819,8 +854,10 @@ def require_product(flight: Flight, name: str) -> None:
         OutputError: with the reason.
     """
     state = flight.numbers.get("products", {}).get(name, MADE)
-    if state not in (MADE, INTERRUPTED):
-        raise OutputError((flight.directory or Path()) / name, f"{state}; all else is there")
+    if state in (MADE, INTERRUPTED):
+        return
+    directory = flight.directory or Path()
+    raise OutputError(directory / name, f"{state}; all else is there")
 
 
 def add_films(
@@ -856,7 +893,7 @@ def add_films(
 
 
 class _Products:
-    """The products of a flight's directory as they are made: which are there, and why others are not."""
+    """The products of a run directory while they are made: which are there, and why others are not."""
 
     def __init__(self, flight: Flight) -> None:
         assert flight.directory is not None
@@ -872,7 +909,7 @@ class _Products:
 
     @contextlib.contextmanager
     def making(self, name: str) -> Iterator[Path]:
-        """A folder for a product; if it cannot be made, the summary says why."""
+        """A folder for a product; if the product cannot be made, the summary says why."""
         try:
             with adding(self.directory, products={name: MADE}) as folder:
                 yield folder
@@ -895,4 +932,4 @@ class _Products:
         before = self._flight.numbers
         products = {**before.get("products", {}), **self._states}
         files = dict(sorted({**before["files"], **self._hashes}.items()))
-        return self._flight._recording(products=products, files=files)
+        return self._flight._with_entries(products=products, files=files)

@@ -35,7 +35,7 @@ ERROR = "error"
 TIMEOUT = "timeout"
 MEMORY = "memory"
 DIED = "died"
-"""Verdicts of flights without a row: an exception, a timeout, too much memory, or a dead process."""
+"""Verdicts of flights that returned no row: an exception, a timeout, too much memory, or a dead process."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PRELOAD: Final = (
     "quadsim",
@@ -44,13 +44,13 @@ _PRELOAD: Final = (
     "quadsim.mpc.laws.parts.preparation",
     "quadsim.mpc.laws.unconstrained",
 )
-"""Preloaded by the server that workers are forked from; the first one finds the others by their place."""
+"""Preloaded by the server that workers are forked from."""
 _DRAWING: Final = "scipy.stats"
 """Preloaded where it is loaded here: it is slow to import, and some campaigns draw with it."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
 _START_S: Final = 60.0  # longest start of a worker, or of the first one of a cluster; not counted as flight time
-_CONNECT_S: Final = 10.0
+_CONNECT_S: Final = 10.0  # longest wait for a scheduler to answer
 
 
 class ClusterError(QuadsimError):
@@ -114,18 +114,20 @@ def _require(workers: int | None, cluster: str | None) -> None:
 # --- on this machine -------------------------------------------------------------------------------------------------
 
 
-def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory: float, isolate: bool) -> FlownRows:
-    """Yield the rows of flights by a number of workers, each with its index; arguments as `fly_many`."""
+def _here(
+    flights: Iterable[Any], pickled_fly: bytes, count: int, timeout: float, memory: float, isolate: bool
+) -> FlownRows:
+    """Yield the rows of flights by `count` workers, each with its index; other arguments as `fly_many`."""
     remaining = enumerate(flights)
     workers = list[_Worker]()
     try:
-        flight = next(remaining, None)
-        while flight is not None or workers:
-            while flight is not None and len(workers) < count:
-                worker = _Worker(fly, timeout, memory)
+        upcoming = next(remaining, None)  # the next flight, after its index; None after the last one
+        while upcoming is not None or workers:
+            while upcoming is not None and len(workers) < count:
+                worker = _Worker(pickled_fly, timeout, memory)
                 workers.append(worker)
-                worker.hand(*flight)
-                flight = next(remaining, None)
+                worker.hand(*upcoming)
+                upcoming = next(remaining, None)
             ready = _wait(workers)
             rows = []
             for worker in workers[:]:
@@ -133,9 +135,10 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
                 if row is None:
                     continue
                 rows.append((worker.place, row))
-                if flight is not None and worker.usable and not isolate:
-                    worker.hand(*flight)
-                    flight = next(remaining, None)
+                flies_again = worker.usable and not isolate
+                if upcoming is not None and flies_again:
+                    worker.hand(*upcoming)
+                    upcoming = next(remaining, None)
                 else:
                     workers.remove(worker)
                     worker.end()
@@ -146,7 +149,7 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
 
 
 def _wait(workers: Sequence[_Worker]) -> Sequence[object]:
-    """Wait until one of the workers has news, or its time is up; return the ends that are ready."""
+    """Wait until one of the workers has news, or its time is up; return those of all workers' `ends` that are ready."""
     ends: list[Any] = []
     for worker in workers:
         ends += worker.ends
@@ -155,24 +158,31 @@ def _wait(workers: Sequence[_Worker]) -> Sequence[object]:
 
 
 class _Worker:
-    """A process that flies one flight at a time."""
+    """A process that flies one flight at a time.
 
-    def __init__(self, fly: bytes, timeout: float, memory: float) -> None:
+    Attributes:
+        place: index of its flight.
+        usable: whether it can fly another flight.
+        deadline: monotonic time by which its flight must have a row [s].
+        ends: its pipe and its process, one of which becomes ready when there is news.
+    """
+
+    def __init__(self, pickled_fly: bytes, timeout: float, memory: float) -> None:
         self._timeout = timeout
         self.place = -1
         self.usable = True
         self.deadline = 0.0
-        self._start_s = _START_S
+        self._start_s = _START_S  # time that its start may take, 0 once it has started
         context = multiprocessing.get_context("forkserver")
         preload = [*_PRELOAD]
         if _DRAWING in sys.modules:
             preload.append(_DRAWING)
         context.set_forkserver_preload(preload)
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, fly, memory), daemon=True)
+        self.process = context.Process(target=_serve, args=(theirs, pickled_fly, memory), daemon=True)
         with closing(theirs), _starting():
             self.process.start()
-        self.ends = (self.pipe, self.process.sentinel)  # either becomes ready when there is news
+        self.ends = (self.pipe, self.process.sentinel)
 
     def hand(self, place: int, flight: Any) -> None:
         """Give it a flight to fly, with its index."""
@@ -184,7 +194,7 @@ class _Worker:
     def row(self, ready: Sequence[object]) -> Row | None:
         """Return the row of its flight; None while it flies."""
         if self.pipe in ready:
-            with suppress(Exception):  # it died while sending it
+            with suppress(Exception):  # it died while it sent the row
                 row = self.pipe.recv()
                 if row is None:  # it has started: its first flight begins now
                     self._start_s = 0.0
@@ -193,25 +203,27 @@ class _Worker:
                 if isinstance(row, dict):
                     self.usable = row.get("verdict") != MEMORY
                     return row
-        self.usable = False
         if self.pipe in ready or self.process.sentinel in ready:
-            self.process.join(0.5)
-            code = self.process.exitcode
-            if code is None:
-                how = "without a row"
-            elif code < 0:
-                how = f"by signal {-code}"
-            else:
-                how = f"with exit status {code}"
-            return {"verdict": DIED, "reason": f"its process ended {how}"}
+            self.usable = False
+            return {"verdict": DIED, "reason": f"its process ended {self._cause_of_end()}"}
         if clock.monotonic() >= self.deadline:
+            self.usable = False
             return {"verdict": TIMEOUT, "reason": f"it took longer than {self._timeout:g} s"}
-        self.usable = True
         return None
+
+    def _cause_of_end(self) -> str:
+        """Return by what its process ended, in words."""
+        self.process.join(0.5)
+        code = self.process.exitcode
+        if code is None:
+            return "without a row"
+        if code < 0:
+            return f"by signal {-code}"
+        return f"with exit status {code}"
 
     def end(self) -> None:
         """Kill it, and its process group."""
-        for kill in (os.killpg, os.kill):  # the second if it has no group yet
+        for kill in (os.killpg, os.kill):  # the process alone, where it has no group yet
             with suppress(OSError):
                 kill(self.process.pid or 0, signal.SIGKILL)
         self.process.join(5.0)
@@ -224,15 +236,15 @@ def _starting() -> Iterator[None]:
     with _STARTING:
         resource_tracker.ensure_running()  # it unblocks signals when it starts
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        before = {name: os.environ.get(name) for name in _ONE_THREAD}
+        threads_before = {name: os.environ.get(name) for name in _ONE_THREAD}
         os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
         script = sys.modules["__main__"]
-        sys.modules["__main__"] = ModuleType("__main__")
+        sys.modules["__main__"] = ModuleType("__main__")  # it has no file that a new process would run
         try:
             yield
         finally:
             sys.modules["__main__"] = script
-            for name, value in before.items():
+            for name, value in threads_before.items():
                 if value is None:
                     del os.environ[name]
                 else:
@@ -240,30 +252,38 @@ def _starting() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
+def _serve(pipe: connection.Connection, pickled_fly: bytes, memory: float) -> None:
     """Fly what arrives until the caller exits."""
     os.setpgid(0, 0)  # Ctrl-C is for the caller; one signal ends everything that a flight starts
     _die_with_caller()
     os.dup2(2, 1)  # output of controllers must not mix with the caller's
     _limit_memory(memory)
     load = functools.cache(pickle.loads)
+
+    def fly(flight: Any) -> Row:
+        function = load(pickled_fly)  # here, so that an error of loading becomes the row of the first flight
+        row: Row = function(flight)
+        return row
+
     with suppress(EOFError, OSError):
-        pipe.send(None)
+        pipe.send(None)  # it has started
         while True:
             flight = pipe.recv()
-            gc.freeze()  # so that the pass below, up to 30 ms, is over what the flight has made alone
-            pipe.send_bytes(_row(lambda flight: load(fly)(flight), flight, memory))
+            gc.freeze()  # so that the collection below looks at this flight's objects alone, and not 30 ms at all
+            pipe.send_bytes(_row(fly, flight, memory))
             gc.collect()  # a flight may leave a dozen megabytes in cycles
 
 
 def _die_with_caller() -> None:
     """Ask the system to kill this group when the caller exits, even while a controller holds the interpreter."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, -os.getpgrp())
-    fcntl.fcntl(parent.sentinel, fcntl.F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, fcntl.fcntl(parent.sentinel, fcntl.F_GETFL) | os.O_ASYNC)
-    if connection.wait([parent.sentinel], 0.0):
+    caller = multiprocessing.parent_process()
+    assert caller is not None
+    sentinel = caller.sentinel  # a pipe that becomes ready when the caller exits
+    flags = fcntl.fcntl(sentinel, fcntl.F_GETFL)
+    fcntl.fcntl(sentinel, fcntl.F_SETOWN, -os.getpgrp())
+    fcntl.fcntl(sentinel, fcntl.F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
+    if connection.wait([sentinel], 0.0):  # the caller exited before this was set
         os.killpg(0, signal.SIGKILL)
 
 
@@ -278,7 +298,7 @@ def _row(fly: Fly, flight: Any, memory: float) -> bytes:
 
 
 def _limit_memory(megabytes: float) -> None:
-    """Limit this process's memory; if the machine runs out of memory, the system kills it first."""
+    """Limit this process's memory beyond what it has; if the machine runs out of it, this one is killed first."""
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     held = re.search(r"^VmData:\s*(\d+) kB", status, flags=re.MULTILINE)
     assert held is not None
@@ -290,24 +310,25 @@ def _limit_memory(megabytes: float) -> None:
 # --- on a cluster ----------------------------------------------------------------------------------------------------
 
 
-def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float, memory: float) -> FlownRows:
+def _on_cluster(address: str, flights: Iterable[Any], pickled_fly: bytes, timeout: float, memory: float) -> FlownRows:
+    """Yield the rows of flights by a process beside each worker of a cluster; arguments and errors as `fly_many`."""
     remaining = enumerate(flights)
-    places = dict[str, int]()
+    places = dict[str, int]()  # of the flights that were submitted, by the keys of their futures
     with _client(address) as client:
         distributed = _distributed()
-        work = distributed.as_completed(loop=client.loop)
+        futures = distributed.as_completed(loop=client.loop)
 
         def submit() -> None:
             """Submit two flights per thread, so that no thread waits for its next one."""
             for place, flight in remaining:
-                future = client.submit(_beside, fly, flight, timeout, memory, _code(), pure=False)
+                future = client.submit(_beside, pickled_fly, flight, timeout, memory, _code(), pure=False)
                 places[future.key] = place
-                work.add(future)
+                futures.add(future)
                 if len(places) >= 2 * _threads(client):
                     break
 
         submit()
-        for future in work:
+        for future in futures:
             try:
                 row = future.result()
             except distributed.KilledWorker as error:  # several Dask workers died with the flight
@@ -322,8 +343,8 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
             yield place, row
 
 
-def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mapping[str, str]) -> Row:
-    """In a Dask worker, fly in a child process, so that no flight can harm the worker."""
+def _beside(pickled_fly: bytes, flight: Any, timeout: float, memory: float, code: Mapping[str, str]) -> Row:
+    """In a Dask worker with the caller's `code`, fly in a child process, so that no flight can harm the worker."""
     differing = []
     for name, value in _code().items():
         if code.get(name) != value:
@@ -331,11 +352,17 @@ def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mappin
     if differing:
         raise ClusterError(f"it has {', '.join(differing)}")
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # it may have children
-    with closing(_here([flight], fly, 1, timeout, memory, isolate=True)) as rows:
-        return next(rows)[1]
+    with closing(_here([flight], pickled_fly, 1, timeout, memory, isolate=True)) as rows:
+        _, row = next(rows)
+        return row
 
 
 def _distributed() -> Any:
+    """Return the package of Dask's clusters.
+
+    Raises:
+        MissingPackageError: it is not installed.
+    """
     try:
         import distributed
     except ModuleNotFoundError as error:

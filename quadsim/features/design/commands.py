@@ -183,12 +183,6 @@ def vehicle_report(
     """
     from quadsim.assets import vehicle_path
     from quadsim.console import results
-    from quadsim.features.design import shortfalls, vehicle_report
-    from quadsim.report import vehicle_drawing
-    from quadsim.scenarios import loading
-    from quadsim.scenarios.assembly import stated_autopilot
-    from quadsim.sim.autopilot import AutopilotSettings
-    from quadsim.vehicle import example_notes, load_vehicle, vehicle_sources
 
     blank = Path(__file__).with_name("vehicle_template.toml")
     if thrust_stand is not None:
@@ -208,7 +202,19 @@ def vehicle_report(
     if name is None:
         names = ", ".join(vehicle_names())
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
-    path = vehicle_path(str(name))
+    return _vehicle_report(vehicle_path(str(name)), scenario, out, overwrite=overwrite)
+
+
+def _vehicle_report(path: Path, scenario: ScenarioName | None, out: File | None, *, overwrite: bool) -> VehicleReport:
+    """Return the report of a vehicle's file, and draw the vehicle to `out`; see `vehicle_report`."""
+    from quadsim.console import results
+    from quadsim.features.design import shortfalls, vehicle_report
+    from quadsim.report import vehicle_drawing
+    from quadsim.scenarios import loading
+    from quadsim.scenarios.assembly import stated_autopilot
+    from quadsim.sim.autopilot import AutopilotSettings
+    from quadsim.vehicle import example_notes, load_vehicle, vehicle_sources
+
     loaded = load_vehicle(path)
     compared = None
     if scenario is not None:
