@@ -231,6 +231,19 @@ def test_a_logarithmic_axis_has_plain_numbers(top: float, shown: set[str]) -> No
     assert not [text for text in texts if "$" in text]
 
 
+def test_a_page_s_axes_have_plain_numbers_and_no_prefixes() -> None:
+    """A tick of 33µ is nobody's unit: numbers are written out, and with a power of ten where they would be long."""
+    x = np.arange(2.0)
+    panels = []
+    for y_log in (False, True):
+        series = Series(x=x, y=np.array([1e-5, 3e-5]), colour="black", label="a")
+        panels.append(Panel(title="time", unit="ms", series=(series,), y_log=y_log))
+    layout = json.loads(to_plot(Figure(key="a", title="a", panels=tuple(panels), end=1.0)).json)["layout"]
+    formats = {name: axis["exponentformat"] for name, axis in layout.items() if "axis" in name}
+    assert formats == {"xaxis": "power", "yaxis": "power", "xaxis2": "power", "yaxis2": "none"}
+    assert layout["yaxis"]["minexponent"] == 5
+
+
 NO_EFFECTS: dict[str, Any] = {"wrench": None, "wind": None, "battery": None}
 
 
