@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -104,11 +104,25 @@ def signals(runs: Sequence[FlightRecord], names: Sequence[str]) -> Figure:
     known = _panels(runs)
     for name in names:
         if name not in known:
-            is_margin = name.startswith(MARGIN_PREFIX)
-            alike = [other for other in known if other.startswith(MARGIN_PREFIX) == is_margin]
-            raise UnknownNameError("signal", name, alike)
+            raise _unknown_signal(name, known)
     panels = tuple(known[name](runs, name) for name in names)
     return _timed("signals", "", panels, runs, columns=1)
+
+
+def signal_names(runs: Sequence[FlightRecord]) -> list[str]:
+    """Return the names that `signals` takes for these runs, margins last, in order."""
+    names = list(_panels(runs))
+    return sorted(names, key=lambda name: (name.startswith(MARGIN_PREFIX), name))
+
+
+def _unknown_signal(name: str, known: Iterable[str]) -> UnknownNameError:
+    """Return the error about a signal that no run has: all names there are, of margins or of other signals."""
+    is_margin = name.startswith(MARGIN_PREFIX)
+    alike = [other for other in known if other.startswith(MARGIN_PREFIX) == is_margin]
+    hint = ""
+    if not is_margin:
+        hint = f"{MARGIN_PREFIX}NAME is the margin of a constraint"
+    return UnknownNameError("signal", name, alike, hint, whole=True)
 
 
 def _panels(runs: Sequence[FlightRecord]) -> dict[str, _PanelOf]:
