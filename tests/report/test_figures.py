@@ -136,6 +136,22 @@ def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_ru
     assert panels(states([late]))["roll [deg]"].bounds == (), "it begins after the flight"
 
 
+def test_a_violated_bound_on_another_signal_has_a_panel(short_run: Flight) -> None:
+    """The bounds on position and attitude are in their panels, and those on rotor speeds in `inputs`."""
+    climb = Limit(name="climb", signal="climb_acceleration", lower=-0.01, upper=0.01)
+    held = Limit(name="tilt", signal="tilt", upper=90.0)
+    others = [Limit(name="x", signal="x", upper=-100.0), Limit(name="speed", signal="speed", upper=1.0)]
+    run = judged_by(short_run, climb, held, *others)
+    figure = states([run])
+    *_, panel = figure.panels
+    assert len(figure.panels) == 7
+    assert panel.heading.startswith("climb_acceleration [m/s^2]")
+    assert {bound.value for bound in panel.bounds} == {-0.01, 0.01}
+    assert figure.title == "position, attitude and other violated signals"
+    assert to_png(figure, dpi=30)
+    assert to_plot(figure).json
+
+
 def test_inputs_are_the_commands_of_each_rotor(short_run: Flight) -> None:
     speeds = short_run.log.control.speeds
     alone = curves(panels(inputs([short_run]))["rotor speed [rad/s]"])
