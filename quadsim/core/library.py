@@ -73,18 +73,17 @@ def _alone(root: Path) -> Iterator[None]:
     """Hold the lock of compiling, once whoever has it is done or dead: the system frees the lock of a dead process.
 
     It is a lock of the folder of the library itself: there is no file to be left behind, and a folder that cannot be
-    written has it too.  Where the file system has no locks, each process compiles for itself, which is slow but safe:
-    the library is replaced atomically.
+    written has it too.  Where it cannot be locked, each process compiles for itself, which is slow but safe: the
+    library is replaced atomically.
     """
-    folder = os.open((root / LIBRARY).parent, os.O_RDONLY | os.O_CLOEXEC)
-    _compiling.set()
-    try:
+    with contextlib.ExitStack() as stack:
+        _compiling.set()
+        stack.callback(_compiling.clear)
         with contextlib.suppress(OSError):
+            folder = os.open((root / LIBRARY).parent, os.O_RDONLY | os.O_CLOEXEC)
+            stack.callback(os.close, folder)
             _lock(folder)
         yield
-    finally:
-        _compiling.clear()
-        os.close(folder)
 
 
 def _lock(folder: int) -> None:
