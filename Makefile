@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all without-features rooms peers firmware betaflight chain check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test test-all without-features peers firmware betaflight chain check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -58,8 +58,6 @@ test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs
 
 test-all: setup $(VENV)/.browser  ## run every test but those of make peers and make firmware
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
-
-rooms: without-features
 
 without-features: setup  ## take each feature away, in a copy, and see the rest pass (OPTIONS=live for one)
 	@$(PY) tests/without_features.py $(OPTIONS)
@@ -135,7 +133,7 @@ $(VENV)/.python:
 	@touch $@
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt hatch_build.py
-	@echo "Installing quadsim and its packages into $(VENV); the first time takes a minute or two"
+	@echo "Installing quadsim and its packages into $(VENV); the first time takes a few minutes"
 	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && \
 		$(PIP_INSTALL) --constraint constraints.txt --group dev && \
 		$(PIP_EDITABLE) .,$(NOT_INSTALLED))

@@ -92,8 +92,9 @@ class ExportError(InputError):
 class UnknownNameError(InputError):
     """A name outside a known set.
 
-    The message lists the set and the closest name, or those in `meant`: other spellings of the same thing.  Of a name
-    that an earlier version had, it tells the `successor`.
+    The message lists the set and the closest name, or those in `meant`: other spellings of the same thing.  Of a long
+    set it lists some names, unless it is to list all: `whole`.  Of a name that an earlier version had, it tells the
+    `successor`.
     """
 
     def __init__(
@@ -104,6 +105,8 @@ class UnknownNameError(InputError):
         hint: str = "",
         meant: Sequence[str] = (),
         successor: str | None = None,
+        *,
+        whole: bool = False,
     ) -> None:
         self.kind = kind
         self.name = name
@@ -120,8 +123,10 @@ class UnknownNameError(InputError):
             tail = f"; {hint}"
         listed = f"there are: {', '.join(self.allowed)}"
         if len(listed) > _LONGEST_LIST:
-            some = self.allowed[: max(1, listed[:_LONGEST_LIST].count(",") - 1)]
-            listed = f"there are {len(self.allowed)}: {', '.join(some)}, ..."
+            some = [*self.allowed]
+            if not whole:
+                some = [*self.allowed[: max(1, listed[:_LONGEST_LIST].count(",") - 1)], "..."]
+            listed = f"there are {len(self.allowed)}: {', '.join(some)}"
         super().__init__(f"no {kind} named {name!r}{guess} ({listed}){tail}")
 
 

@@ -23,7 +23,7 @@ from quadsim.features.entries import FEATURES
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim",)
 PAGE = ROOT / "docs" / "architecture.md"
-USERS_IMPORT = ("quadsim", "quadsim.gym")
+USERS_IMPORT = ("quadsim", "quadsim.__main__", "quadsim.gym")
 MPC_MAY_IMPORT = {
     f"quadsim.{name}" for name in ("vehicle", "state", "rotation", "errors", "fields", "controller", "motion", "space",
                                       "ties", "input_limits",

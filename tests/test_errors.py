@@ -74,3 +74,6 @@ def test_an_unknown_name_is_answered_with_the_nearest_if_there_is_one_and_all_th
         "see quadsim list"
     )
     assert str(UnknownNameError("solver", "osqp", ["dense"])) == "no solver named 'osqp' (there are: dense)"
+    names = [f"signal_{i}" for i in range(40)]
+    assert str(UnknownNameError("signal", "q", names)).endswith(", ...)")
+    assert str(UnknownNameError("signal", "q", names, whole=True)).endswith(", signal_9)")

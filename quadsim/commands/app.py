@@ -624,7 +624,7 @@ def plot(
     """
     from quadsim.rollout.flight_plot import plot_runs
     from quadsim.rollout.flown import Flight
-    from quadsim.rollout.stored import read_flight
+    from quadsim.rollout.stored import read_plotted
 
     if isinstance(flights, Flight | str | Path):
         flights = [flights]
@@ -633,7 +633,7 @@ def plot(
         if isinstance(flight, Flight):
             runs.append(flight)
         else:
-            runs.append(read_flight(Path(flight)))
+            runs.append(read_plotted(Path(flight), runs))
     return plot_runs(runs, signals, labels=labels, width=width, style=style, out=out, overwrite=overwrite)
 
 

@@ -9,6 +9,8 @@ import time as clock
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Final
 
+from quadsim.core.library import is_compiling
+
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
@@ -79,7 +81,7 @@ def _bars(screen: PlainConsole) -> Iterator[Progress]:
 def lines(screen: PlainConsole, first: str) -> Iterator[Callable[[str], None]]:
     """Yield a function that takes what is done now; the latest is printed every `LINE_EVERY`, also while it lasts.
 
-    `first` is what is done at first.
+    `first` is what is done at first.  While the C library compiles, the line says so instead.
     """
     from quadsim.console import console
 
@@ -94,7 +96,10 @@ def lines(screen: PlainConsole, first: str) -> Iterator[Callable[[str], None]]:
     def tick() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are for the thread that works
         while not over.wait(LINE_EVERY):
-            console.show([f"quadsim: {now}, {clock.monotonic() - started:.0f} s so far"], screen)
+            activity = now
+            if is_compiling():
+                activity = "compiling the C library"
+            console.show([f"quadsim: {activity}, {clock.monotonic() - started:.0f} s so far"], screen)
 
     ticking = threading.Thread(target=tick, daemon=True)
     ticking.start()

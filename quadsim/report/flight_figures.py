@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -47,6 +47,8 @@ PAPER_FIGURES: Final = {
     "paper-constrained": ("figure4_", "figure5_"),
 }
 """Prefixes of the keys of the state and input figures, by scenario: their numbers in the paper."""
+_INPUTS: Final = {"speed": "rotor speed", "slew": "step per period"}
+"""Titles of the panels of `inputs`, by signal."""
 _PanelOf = Callable[[Sequence[FlightRecord], str], Panel]  # of the signal of a name
 _LEAST_MOTION: Final = 0.1  # smallest span of a course [m] that counts as motion along an axis
 
@@ -104,11 +106,25 @@ def signals(runs: Sequence[FlightRecord], names: Sequence[str]) -> Figure:
     known = _panels(runs)
     for name in names:
         if name not in known:
-            is_margin = name.startswith(MARGIN_PREFIX)
-            alike = [other for other in known if other.startswith(MARGIN_PREFIX) == is_margin]
-            raise UnknownNameError("signal", name, alike)
+            raise _unknown_signal(name, known)
     panels = tuple(known[name](runs, name) for name in names)
     return _timed("signals", "", panels, runs, columns=1)
+
+
+def signal_names(runs: Sequence[FlightRecord]) -> list[str]:
+    """Return the names that `signals` takes for these runs, margins last, in order."""
+    names = list(_panels(runs))
+    return sorted(names, key=lambda name: (name.startswith(MARGIN_PREFIX), name))
+
+
+def _unknown_signal(name: str, known: Iterable[str]) -> UnknownNameError:
+    """Return the error about a signal that no run has: all names there are, of margins or of other signals."""
+    is_margin = name.startswith(MARGIN_PREFIX)
+    alike = [other for other in known if other.startswith(MARGIN_PREFIX) == is_margin]
+    hint = ""
+    if not is_margin:
+        hint = f"{MARGIN_PREFIX}NAME is the margin of a constraint"
+    return UnknownNameError("signal", name, alike, hint, whole=True)
 
 
 def _panels(runs: Sequence[FlightRecord]) -> dict[str, _PanelOf]:
@@ -128,7 +144,10 @@ def _panels(runs: Sequence[FlightRecord]) -> dict[str, _PanelOf]:
 
 
 def states(runs: Sequence[FlightRecord]) -> Figure:
-    """Plot position and attitude; also tilt and quaternion if the vehicle may turn upside down."""
+    """Plot position and attitude; also tilt and quaternion if the vehicle may turn upside down.
+
+    Other signals with a violated bound have a panel each behind these, unless `inputs` has it.
+    """
     names: tuple[str, ...]
     if all(run.log.plant.attitude is None for run in runs):
         names = ("x", "roll", "y", "pitch", "z", "yaw")
@@ -141,7 +160,24 @@ def states(runs: Sequence[FlightRecord]) -> Figure:
         quaternion, body_rates = _attitude_panels(runs[0])
         panels.insert(3, quaternion)  # beside y
         panels.append(body_rates)  # beside z
-    return _timed("states", "position and attitude", tuple(panels), runs)
+    title = "position and attitude"
+    others = _violated_signals(runs, {*names, *_INPUTS})
+    if others:
+        title = "position, attitude and other violated signals"
+    for name in others:
+        panels.append(signal_panel(runs, name))
+    return _timed("states", title, tuple(panels), runs)
+
+
+def _violated_signals(runs: Sequence[FlightRecord], drawn: Collection[str]) -> list[str]:
+    """Return the signals of violated bounds of any run, but for those that are drawn, in order."""
+    violated = dict[str, None]()
+    for run in runs:
+        for finding in run.findings:
+            signal = finding.limit.signal
+            if finding.verdict == "violated" and signal in SIGNALS and signal not in drawn:
+                violated[signal] = None
+    return list(violated)
 
 
 def _attitude_panels(run: FlightRecord) -> tuple[Panel, Panel]:
@@ -156,14 +192,13 @@ def _attitude_panels(run: FlightRecord) -> tuple[Panel, Panel]:
 
 def inputs(runs: Sequence[FlightRecord]) -> Figure:
     """Plot rotor speeds and their steps: one panel for a single run, one panel per rotor for several."""
-    titles = {"speed": "rotor speed", "slew": "step per period"}
     panels = []
     if len(runs) == 1:
-        for name, title in titles.items():
+        for name, title in _INPUTS.items():
             panels.append(replace(signal_panel(runs, name), title=title, height=1.3))
         return _timed("inputs", "rotor speeds and their steps", tuple(panels), runs, columns=1)
     for rotor in range(N_ROTORS):
-        for name, title in titles.items():
+        for name, title in _INPUTS.items():
             signal = SIGNALS[name]
             curves = []
             for i, label, run in flown_runs(runs):

@@ -11,7 +11,14 @@ from typing import Final
 from quadsim.errors import printable
 
 ABSENT: Final = "-"
-_NEGLIGIBLE: Final = {"m": (1e-9, "< 1 nm"), "deg": (1e-6, "0"), "rad/s": (1e-6, "0")}
+_NEGLIGIBLE: Final = {
+    "m": (1e-9, "< 1 nm"),
+    "deg": (1e-6, "0"),
+    "rad/s": (1e-6, "0"),
+    "m/s": (1e-9, "0"),
+    "deg/s": (1e-6, "0"),
+    "-": (1e-9, "0"),
+}
 """By unit: below which magnitude a number is rounding, and what is shown instead."""
 
 
@@ -132,6 +139,21 @@ def format_number(value: float | None) -> str:
     if size == 0.0 or 1e-3 <= size < 1e7:
         return f"{value:.4g}"
     return f"{value:.1e}"
+
+
+def without_rounding(value: float, unit: str) -> float:
+    """Return a number, or 0 where its magnitude is only rounding in its unit."""
+    least, _text = _NEGLIGIBLE.get(unit, (0.0, ""))
+    if abs(value) < least:
+        return 0.0
+    return value
+
+
+def format_quantity(value: float | None, unit: str) -> str:
+    """Return a number in its unit as `format_number` does, and 0 where it is only rounding."""
+    if value is None:
+        return ABSENT
+    return format_number(without_rounding(value, unit))
 
 
 def signed_number(value: float, decimals: int) -> str:

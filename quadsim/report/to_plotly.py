@@ -24,6 +24,7 @@ _GAP: Final = 56  # between rows of panels [px]
 _LABELLED_GAP: Final = 76  # likewise, where each row has a label [px]
 _SCENE_HEIGHT: Final = 560  # of a scene [px]
 _LEAST_SHARE: Final = 0.4  # length of a scene's shorter axes, at least, as a share of the longest
+_LARGEST_PLAIN_EXPONENT: Final = 5  # of 10 in an axis' numbers, up to which they are written out
 _MOST_POINTS: Final = 3000  # of a curve, or a path
 _FEWEST_POINTS: Final = 200  # of a curve, however many runs there are
 _POINTS_OF_ALL_RUNS: Final = 12_000
@@ -62,6 +63,10 @@ def embed(
 ) -> Plot:
     """A figure of plotly's for a page, without plotly's own template and legend: the page gives its colours."""
     canvas.update_layout(template="none", showlegend=False, height=height)
+    for update in (canvas.update_xaxes, canvas.update_yaxes):
+        update(exponentformat="power", minexponent=_LARGEST_PLAIN_EXPONENT)
+    # a logarithmic axis would have a power at each of its ticks
+    canvas.update_yaxes(exponentformat="none", selector={"type": "log"})
     json = str(canvas.to_json()).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     return Plot(key=key, title=title, height=height, timed=timed, json=json, labels=dict(labels), note=note)
 
@@ -183,7 +188,8 @@ def _space(drawn: Array) -> dict[str, Any]:
     }
     for i, name in enumerate("xyz"):
         ends = [middle[i] - half[i], middle[i] + half[i]]
-        space[f"{name}axis"] = {"title": {"text": f"{name} [m]"}, "range": ends}
+        axis = {"title": {"text": f"{name} [m]"}, "range": ends, "exponentformat": "none"}
+        space[f"{name}axis"] = axis
     return space
 
 

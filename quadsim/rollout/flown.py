@@ -434,6 +434,9 @@ class Flight(Result):
     ) -> Path:
         """Write the run directory, as `quadsim run` does: tables and summary first, then figures, recording and video.
 
+        All but the video takes seconds.  The video takes one to several seconds for each second of flight where no
+        graphics card renders it; `video=False` does without.
+
         Args:
             directory: run directory.
             overwrite: whether to replace an earlier output.

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,9 @@ from quadsim.errors import FileError, printable
 from quadsim.flight import rundir
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
+from quadsim.flight.record import FlightRecord
 from quadsim.report.comparison_rows import comparison_rows
+from quadsim.report.flight_figures import signal_names
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.courses.csv_course import Csv
@@ -66,6 +68,21 @@ def read_flight(directory: Path) -> Flight:
         what = f"{type(error).__name__}: {printable(str(error))}"
         raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({what[:200]})") from error
     return flight
+
+
+def read_plotted(directory: Path, before: Sequence[FlightRecord]) -> Flight:
+    """Read a run to plot, as `read_flight`; `before` are the flights named before it.
+
+    Raises:
+        FileError: it is no run.  A path that does not exist, behind a run, is taken for a signal: the error says how
+            signals are named, and which there are.
+        InputError: its scenario is malformed.
+    """
+    if before and not directory.exists():
+        names = ", ".join(signal_names(before))
+        problem = "is not a run directory; signals are named behind --signals, as in quadsim plot RUN --signals z roll"
+        raise FileError(directory, f"{problem} (there are: {names})")
+    return read_flight(directory)
 
 
 def _stored_log(directory: Path, summary: Mapping[str, Any]) -> FlightLog:

@@ -129,8 +129,12 @@ def test_it_is_drawn(flight: Flight) -> None:
     assert len(axes[2].get_lines()) == 4
     assert len(flight.plot()) == 6
     assert flight.plot("xy")[0].get_xlabel() == "x [m]"
-    with pytest.raises(UnknownNameError, match="'rol'"):
+    with pytest.raises(UnknownNameError, match="'rol'") as refused:
         flight.plot("rol")
+    message = str(refused.value)
+    assert "did you mean 'roll'?" in message
+    for name in ("x_error", "z_error", "margin.NAME", "command"):
+        assert name in message, "every signal is named"
     page = flight._repr_html_()
     assert "<svg" in page
     for finding in flight.audit:

@@ -223,6 +223,18 @@ def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
     assert json.loads(capsys.readouterr().out)["products"] == {"flight.rrd": "made"}
 
 
+def test_a_signal_named_like_a_run_is_pointed_to_its_option(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "hover", *SHORT, *TABLES]) == EXIT_DONE
+    capsys.readouterr()
+    assert main(["plot", "runs/hover", "z", "--out", "z.pdf"]) == EXIT_WRONG_INPUT
+    error = capsys.readouterr().err
+    assert error.startswith("quadsim: z: is not a run directory; signals are named behind --signals")
+    for name in ("x_error", "z", "command", "step_ms", "margin.roll"):
+        assert f" {name}" in error
+    assert main(["plot", "nowhere", "--out", "z.pdf"]) == EXIT_WRONG_INPUT
+    assert "--signals" not in capsys.readouterr().err, "the first is a run"
+
+
 def test_settings_and_seed_reach_the_flight(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--set", "controller.horizon=12", "--set", "vehicle.mass=4.2", "--seed", "9"]
     assert main(["run", "hover", *SHORT, *TABLES, *settings, "--json"]) == EXIT_DONE

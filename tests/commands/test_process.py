@@ -45,6 +45,17 @@ def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     assert (process.wait(timeout=60), output) == (EXIT_FAILED, b"")
 
 
+@pytest.mark.representative("process")
+@pytest.mark.parametrize("words", [["--version"], ["no-such-command"]])
+def test_the_package_is_a_command_too(words: list[str]) -> None:
+    script = [str(Path(sysconfig.get_path("scripts")) / "quadsim")]
+    results = []
+    for command in (script, [sys.executable, "-m", "quadsim"]):
+        done = subprocess.run([*command, *words], env=environment(), capture_output=True, text=True, check=False)
+        results.append((done.returncode, done.stdout, done.stderr))
+    assert results[0] == results[1]
+
+
 HELD = "import numpy as np\ndef held(now, state, reference):\n    import random\n    return np.full(4, 192.8)\n"
 
 

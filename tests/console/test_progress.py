@@ -44,6 +44,13 @@ def test_elsewhere_lines_say_what_is_done_however_long_it_takes(lines: Callable[
         assert lines()[-1] == "quadsim: figures, 0 s so far"
 
 
+def test_a_first_use_says_that_it_compiles(lines: Callable[[], list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    with reporting(True, "the flight"):
+        monkeypatch.setattr("quadsim.console.progress.is_compiling", lambda: True)
+        assert lines()[-1] == "quadsim: compiling the C library, 0 s so far"
+        monkeypatch.undo()
+
+
 def test_no_progress_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("quadsim.console.progress.LINE_EVERY", 0.01)
     with reporting(False, "the flight") as report:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import errno
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import time as clock
 from collections.abc import Callable
 from pathlib import Path
 
@@ -130,6 +134,93 @@ def test_a_stale_library_is_replaced_and_not_overwritten(tree: Path) -> None:
         assert load_from(tree).answer() == 2
         assert mapped.read() == before
     assert build.is_current(tree)
+
+
+# Several processes at once
+
+SLOW_COMPILER = """#!/bin/sh
+echo compiling >> "$0.calls"
+sleep "$(cat "$0.seconds")"
+exec cc "$@"
+"""
+LOADING = """
+import logging, sys
+from pathlib import Path
+from quadsim.core.library import load_from
+logging.basicConfig(format="%(message)s", level=logging.INFO)
+print(load_from(Path(sys.argv[1])).answer())
+"""
+
+
+@pytest.fixture
+def slow_compiler(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A compiler that takes a second, and notes each call in `cc.calls` beside it."""
+    path = tmp_path_factory.mktemp("slow") / "cc"
+    path.write_text(SLOW_COMPILER)
+    path.chmod(0o755)
+    path.with_suffix(".seconds").write_text("1")
+    monkeypatch.setenv("CC", str(path))
+    return path
+
+
+def loading(tree: Path) -> subprocess.Popen[str]:
+    """Start a process that loads the library, and prints what its function answers."""
+    return subprocess.Popen(
+        [sys.executable, "-c", LOADING, tree],
+        cwd=build.ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def calls(compiler: Path, *, at_least: int = 0) -> int:
+    """Return how often the compiler was called, once it was so often."""
+    noted = compiler.with_suffix(".calls")
+    deadline = clock.monotonic() + 60.0
+    while clock.monotonic() < deadline:
+        count = 0
+        if noted.exists():
+            count = noted.read_text().count("compiling")
+        if count >= at_least:
+            return count
+        clock.sleep(0.02)
+    raise TimeoutError(f"{compiler} was not called {at_least} times")
+
+
+def test_one_process_compiles_and_the_others_wait_for_it(tree: Path, slow_compiler: Path) -> None:
+    first = loading(tree)
+    calls(slow_compiler, at_least=1)
+    others = [loading(tree), loading(tree)]
+    answers = [process.communicate(timeout=60.0) for process in (first, *others)]
+    assert [answer for answer, _ in answers] == ["1\n"] * 3
+    assert calls(slow_compiler) == 1
+    assert "compiling the C library" in answers[0][1]
+    for _answer, told in answers[1:]:
+        assert told == "waiting for another process, which compiles the C library\n"
+
+
+def test_a_process_that_dies_while_it_compiles_holds_nobody_up(tree: Path, slow_compiler: Path) -> None:
+    slow_compiler.with_suffix(".seconds").write_text("300")
+    first = loading(tree)
+    calls(slow_compiler, at_least=1)
+    slow_compiler.with_suffix(".seconds").write_text("0")
+    second = loading(tree)
+    first.kill()
+    assert second.communicate(timeout=60.0)[0] == "1\n"
+    assert calls(slow_compiler) == 2
+    os.killpg(first.pid, signal.SIGKILL)  # its compiler
+    first.communicate()
+
+
+def test_a_file_system_without_locks_does_without(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(folder: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(library.fcntl, "flock", refuse)
+    assert load_from(tree).answer() == 1
+    assert not library.is_compiling()
 
 
 def flag(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,8 @@ from quadsim.scenarios.loading import load_scenario
 
 Answer = tuple[str, ...]
 """Number, status, changes, four commands, ticks, as main.c prints them."""
+EVERY_PERIOD = "CPPFLAGS=-DPRINT_PERIODS=1"
+"""Setting of an export's Makefile with which `make check` prints the answer to every period."""
 Export = Callable[..., Path]
 Answers = Callable[..., list[Answer]]
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -78,7 +80,7 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
         if TARGETS[target].board:
             run(TARGETS[target].compiler, "--version")
             run("qemu-system-arm", "--version")
-        done = run("make", "-C", directory, "check", *make)
+        done = run("make", "-C", directory, "check", *make, EVERY_PERIOD)
         lines = [tuple(line.split()) for line in (done.stdout + done.stderr).splitlines()]
         return [line for line in lines if len(line) == 8]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exported_c import Host
-from firmware.conftest import Run, defines_of
+from firmware.conftest import EVERY_PERIOD, Run, defines_of
 from firmware.test_fuzz import HANGS, HERE, SANITIZERS
 from firmware.test_static import ALLOWED, CPPCHECK, EXPORTS, TIDY, WARNINGS, undefined
 
@@ -61,7 +61,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
 
 def check(directory: Path, run: Run, *make: str) -> list[tuple[str, ...]]:
     """What a program answers to all recorded periods: number, status, changes, four commands, ticks."""
-    done = run("make", "-C", directory, "check", *make)
+    done = run("make", "-C", directory, "check", *make, EVERY_PERIOD)
     lines = [tuple(line.split()) for line in (done.stdout + done.stderr).splitlines()]
     return [line for line in lines if len(line) == 8]
 
@@ -70,6 +70,26 @@ def check(directory: Path, run: Run, *make: str) -> list[tuple[str, ...]]:
 @pytest.mark.parametrize("law", LAWS)
 def test_every_recorded_period_agrees(law: str, precision: Precision, exported: Exported, run: Run) -> None:
     assert len(check(exported(law, precision), run)) == 75
+
+
+def test_a_check_is_one_sentence_and_a_line_of_each_period_that_differs(
+    exported: Exported, run: Run, tmp_path: Path
+) -> None:
+    directory = tmp_path / "c"
+    shutil.copytree(exported("plain"), directory, ignore=shutil.ignore_patterns("*.o", "*.elf"))
+    command = ("make", "--silent", "-C", directory, "check")
+    assert run(*command).stdout == "every recorded period agrees\n"
+    main = directory / "main.c"
+    source = main.read_text()
+    off = "const quadsim_real off = command[j] - recorded->command[j]"
+    assert off in source
+    main.write_text(source.replace(off, f"{off} + (quadsim_real)(k == 7)"))
+    done = run(*command, check=False)
+    line, sentence = done.stdout.splitlines()
+    assert done.returncode != 0
+    assert line.startswith("wrong: 00000007 ")
+    assert len(line.split()) == 9
+    assert sentence.startswith("wrong: a status or a command is not the recorded one; ")
 
 
 @pytest.mark.parametrize("law", ["plain", "fed forward"])

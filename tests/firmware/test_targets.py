@@ -129,6 +129,7 @@ def test_the_robust_controller_too(other: str, precision: str, answers: Answers)
 
 WASM = [
     *("clang", "--target=wasm32", "-O3", "-std=c99", "-ffp-contract=off", "-fno-builtin", "-nostdlib", "-Dmain=answer"),
+    "-DPRINT_PERIODS=1",
     *("-Wl,--no-entry,--allow-undefined", "-Wl,--export=answer,--export=memory"),
 ]
 STRING = """#include <stddef.h>

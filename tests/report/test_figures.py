@@ -136,6 +136,22 @@ def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_ru
     assert panels(states([late]))["roll [deg]"].bounds == (), "it begins after the flight"
 
 
+def test_a_violated_bound_on_another_signal_has_a_panel(short_run: Flight) -> None:
+    """The bounds on position and attitude are in their panels, and those on rotor speeds in `inputs`."""
+    climb = Limit(name="climb", signal="climb_acceleration", lower=-0.01, upper=0.01)
+    held = Limit(name="tilt", signal="tilt", upper=90.0)
+    others = [Limit(name="x", signal="x", upper=-100.0), Limit(name="speed", signal="speed", upper=1.0)]
+    run = judged_by(short_run, climb, held, *others)
+    figure = states([run])
+    *_, panel = figure.panels
+    assert len(figure.panels) == 7
+    assert panel.heading.startswith("climb_acceleration [m/s^2]")
+    assert {bound.value for bound in panel.bounds} == {-0.01, 0.01}
+    assert figure.title == "position, attitude and other violated signals"
+    assert to_png(figure, dpi=30)
+    assert to_plot(figure).json
+
+
 def test_inputs_are_the_commands_of_each_rotor(short_run: Flight) -> None:
     speeds = short_run.log.control.speeds
     alone = curves(panels(inputs([short_run]))["rotor speed [rad/s]"])
@@ -229,6 +245,19 @@ def test_a_logarithmic_axis_has_plain_numbers(top: float, shown: set[str]) -> No
     texts = {text.get_text() for text in canvas.axes[0].yaxis.get_ticklabels(which="both")}
     assert shown <= texts
     assert not [text for text in texts if "$" in text]
+
+
+def test_a_page_s_axes_have_plain_numbers_and_no_prefixes() -> None:
+    """A tick of 33µ is nobody's unit: numbers are written out, and with a power of ten where they would be long."""
+    x = np.arange(2.0)
+    panels = []
+    for y_log in (False, True):
+        series = Series(x=x, y=np.array([1e-5, 3e-5]), colour="black", label="a")
+        panels.append(Panel(title="time", unit="ms", series=(series,), y_log=y_log))
+    layout = json.loads(to_plot(Figure(key="a", title="a", panels=tuple(panels), end=1.0)).json)["layout"]
+    formats = {name: axis["exponentformat"] for name, axis in layout.items() if "axis" in name}
+    assert formats == {"xaxis": "power", "yaxis": "power", "xaxis2": "power", "yaxis2": "none"}
+    assert layout["yaxis"]["minexponent"] == 5
 
 
 NO_EFFECTS: dict[str, Any] = {"wrench": None, "wind": None, "battery": None}

@@ -32,7 +32,16 @@ from quadsim.features.campaign.statistics import ALPHA, Judgement, count_of, dri
 from quadsim.outputs import SUMMARY_FILE, optional
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.page import PAGE_FILE, Section, render_page
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.report.table import (
+    ABSENT,
+    Cell,
+    Grid,
+    Mark,
+    format_number,
+    format_quantity,
+    line,
+    without_rounding,
+)
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.report.to_plotly import Plot, to_plot
 from quadsim.state import Array
@@ -180,7 +189,8 @@ def constraint_table(summary: CampaignSummary) -> Grid:
         margin = ABSENT
         flight = ABSENT
         if constraint["worst_margin"] is not None:
-            margin = f"{format_number(constraint['worst_margin'])} {constraint['unit']}"
+            unit = constraint["unit"]
+            margin = f"{format_quantity(constraint['worst_margin'], unit)} {unit}"
             flight = str(constraint["worst_flight"])
         count = Cell(text=str(not_held["count"]), mark=mark)
         lines.append(line(name, count, *_shares(not_held), margin, flight))
@@ -198,8 +208,9 @@ def metric_table(summary: CampaignSummary) -> Grid:
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = []
     for name, metric in summary["metrics"].items():
-        values = [format_number(metric[measure]) for measure in measures]
-        lines.append(line(label(name, metric["unit"]), *values, str(metric["flights"])))
+        unit = metric["unit"]
+        values = [format_quantity(metric[measure], unit) for measure in measures]
+        lines.append(line(label(name, unit), *values, str(metric["flights"])))
     note = "Over the flights that have the number, lost ones, up to where they were aborted, included."
     return _grid("metrics", ("metric", *measures, "flights"), lines, note)
 
@@ -226,7 +237,8 @@ def _worst_margin(summary: CampaignSummary, flight: Mapping[str, Any]) -> tuple[
     name = flight["worst_constraint"]
     if name is None:
         return ABSENT, ABSENT
-    return f"{format_number(flight['margin'])} {summary['constraints'][name]['unit']}", name
+    unit = summary["constraints"][name]["unit"]
+    return f"{format_quantity(flight['margin'], unit)} {unit}", name
 
 
 def worst_draws_table(summary: CampaignSummary) -> Grid:
@@ -469,7 +481,7 @@ def histograms(table: pa.Table) -> list[Panel]:
     """Plot the distribution of the main metrics that differ between flights, by verdict."""
     panels = []
     for name in MAIN_METRICS:
-        values = numbers(table, name)
+        values = _without_rounding(table, name)
         finite = values[np.isfinite(values)]
         if finite.size >= 2 and np.ptp(finite) > 0.0:
             panels.append(_histogram(table, name, values, finite))
@@ -511,7 +523,7 @@ def _bin_edges(finite: Array) -> Array:
 
 def scatters(table: pa.Table) -> list[Panel]:
     """The worst margin of each flight over each varied parameter; triangles are beyond the axes, or have no margin."""
-    margins = numbers(table, "worst_margin")
+    margins = _without_rounding(table, "worst_margin")
     known = np.isfinite(margins)
     if not known.any():
         return []
@@ -540,6 +552,15 @@ def scatters(table: pa.Table) -> list[Panel]:
             )
         )
     return panels
+
+
+def _without_rounding(table: pa.Table, name: str) -> Array:
+    """Return a metric (K,), with 0 where it is only rounding in its unit."""
+    unit = unit_of(table, name)
+    values = []
+    for value in numbers(table, name):
+        values.append(without_rounding(value, unit))
+    return np.array(values, float)
 
 
 def _drawn_values(table: pa.Table, name: str) -> tuple[Array, tuple[str, ...]]:

@@ -60,7 +60,7 @@ from quadsim.report.comparison import different_audits
 from quadsim.report.comparison_page import TABLE_FILE
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.page import PAGE_FILE, Section, render_page
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, format_quantity, line, section
 from quadsim.report.to_plotly import to_plot
 from quadsim.scenarios.schema.settings import field_text
 
@@ -558,16 +558,19 @@ def _metric_table(comparison: PairedComparison) -> Grid:
     lines = []
     for metric in comparison.metrics:
         difference = metric.difference
+        if not difference.pairs:
+            continue
+        unit = metric.unit
         mark = Mark.BEST if metric.is_beyond_chance else Mark.NONE
         interval = ABSENT
         if difference.lower is not None and difference.upper is not None:
-            interval = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
+            interval = f"{format_quantity(difference.lower, unit)} to {format_quantity(difference.upper, unit)}"
         lines.append(
             line(
-                label(metric.name, metric.unit),
-                format_number(metric.mean_a),
-                format_number(metric.mean_b),
-                Cell(text=format_number(difference.mean), mark=mark),
+                label(metric.name, unit),
+                format_quantity(metric.mean_a, unit),
+                format_quantity(metric.mean_b, unit),
+                Cell(text=format_quantity(difference.mean, unit), mark=mark),
                 interval,
                 str(difference.pairs),
             )

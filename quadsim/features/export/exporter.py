@@ -375,7 +375,7 @@ state, and of the C library `memcpy`, `memmove` and `memset`.
 | `{DATA_FILE}` | this controller's numbers, and the memory that it needs |
 | `{FACTS}` | {facts} |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
-| `main.c`, `Makefile` | `make check` runs these periods and compares |
+| `main.c`, `Makefile` | `make check` runs these periods, compares, and prints those that differ |
 | `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
 | `target.h` and what implements it | the clock, the console and the serial line that these two need of a machine |
 

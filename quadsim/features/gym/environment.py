@@ -316,7 +316,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._answered = (self.started.k, action, command)
 
     def flight(self) -> Flight:
-        """Return the episode so far as an audited flight, which can be saved and plotted."""
+        """Return the episode so far as an audited flight, which can be saved and plotted.
+
+        Its `save` also films it, which may take minutes; `save(directory, video=False)` does without the film.
+        """
         controller = self.started.loop.controller
         return replace(self.started.flight(), controller=controller.name, solver=controller.solver)
 

@@ -209,7 +209,8 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
     def flight(self, place: int, *, ended: bool = False) -> Flight:
         """Return an environment's episode as an audited flight, which can be saved, plotted and filmed.
 
-        It is flown again by the recorded actions: the same bits.
+        It is flown again by the recorded actions: the same bits.  Its `save` also films it, which may take minutes;
+        `save(directory, video=False)` does without the film.
 
         Args:
             place: the environment, from 0 to N - 1.

@@ -46,6 +46,9 @@ def fly_live(
 
     The other arguments are those of `quadsim.features.live.commands.live`; `place` is the port, the host and the
     browser.
+
+    Raises:
+        KeyboardInterrupt: it was interrupted before its first period, and so has no flight.
     """
     inputs = None
     if script is None:
@@ -71,6 +74,8 @@ def fly_live(
                     console.show(f"quadsim: refused: {script}: {reason}".split("\n"), console.stderr())
         except KeyboardInterrupt:
             print(file=sys.stderr)
+            if not session.k:
+                raise KeyboardInterrupt(_nothing_flown(has_page=inputs is None)) from None
         finally:  # what was flown is saved, whatever ended it
             hold.flown = True
             if session.k:
@@ -90,6 +95,13 @@ def fly_live(
         if session.reason is not None or refused:
             status = EXIT_FAILED
         return Document(text, facts, status)
+
+
+def _nothing_flown(*, has_page: bool) -> str:
+    """Return what there is of a session that was interrupted before its first period."""
+    if has_page:
+        return "no page was opened, with which the flight begins: nothing was flown, and nothing is written"
+    return "nothing was flown, and nothing is written"
 
 
 class _Saving:

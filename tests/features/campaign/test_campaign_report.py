@@ -15,6 +15,7 @@ from browser import CLASHES, opened
 from quadsim.features.campaign.campaign_file import CampaignFile
 from quadsim.features.campaign.campaign_report import (
     campaign_overview,
+    constraint_table,
     group_table,
     histograms,
     scatters,
@@ -142,6 +143,19 @@ def test_every_flight_is_in_its_histogram_below_or_above_the_bound(thousand: pa.
     assert sum(series.y.sum() for series in bars.values()) == np.isfinite(values).sum()
     assert bars["violated"].y[bars["violated"].x > 0.0].sum() == 0.0, "no bar holds both sides of 0"
     np.testing.assert_array_equal(bars["violated"].base, bars["satisfied"].y + bars["satisfied"].base)
+
+
+def test_what_is_only_rounding_is_0(thousand: pa.Table) -> None:
+    """A margin of 2.8e-14 rad/s is a bound that is reached, and a spread of such margins is no histogram."""
+    table = with_values(thousand, "margin.slew", {0: 2.8e-14})
+    summary = estimate(table)
+    (slew,) = [cells for cells in constraint_table(summary).lines if cells[0].text == "slew"]
+    assert slew[4].text == "0 rad/s"
+    reached = dict(enumerate(np.random.default_rng(0).normal(scale=1e-14, size=thousand.num_rows)))
+    table = with_values(thousand, "worst_margin", reached)
+    assert "worst margin" not in {panel.x_label.partition(" [")[0] for panel in histograms(table)}
+    panel = over(table, "wind")
+    assert {float(value) for series in panel.series for value in series.y} == {0.0}
 
 
 def test_a_flight_far_out_is_at_the_edge_and_does_not_flatten_the_others(thousand: pa.Table) -> None:

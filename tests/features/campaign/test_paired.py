@@ -106,6 +106,26 @@ def test_metrics_are_compared_where_both_were_completed(thousand: pa.Table, bett
     assert metric.difference.lower > 0.1
 
 
+def test_a_metric_that_no_pair_has_is_absent_from_the_table(thousand: pa.Table) -> None:
+    """A line of `-` says nothing; the data keep the metric."""
+    none = changed(thousand, "peak_tilt", [None] * thousand.num_rows)
+    for second in (none, thousand):
+        result = compare_pairs(none, second, NAMES)
+        _events, metrics = result.tables
+        assert "peak_tilt" in result.to_json()["metrics"]
+        names = {line[0].text.partition(" [")[0] for line in metrics.lines}
+        assert "peak_tilt" not in names
+        assert "worst_margin" in names
+
+
+def test_a_difference_within_rounding_is_0(thousand: pa.Table) -> None:
+    errors = np.array(thousand["rmse.x"].to_pylist(), float)
+    moved = changed(thousand, "rmse.x", [*(errors + 3e-14)])
+    _events, metrics = compare_pairs(thousand, moved, NAMES).tables
+    (of_x,) = [line for line in metrics.lines if line[0].text == "rmse.x [m]"]
+    assert [cell.text for cell in of_x[3:5]] == ["0", "0 to 0"]
+
+
 def test_a_campaign_and_itself_are_not_distinguishable(thousand: pa.Table) -> None:
     result = compare_pairs(thousand, thousand, ("a", "b"))
     assert result.verdict == "not distinguishable"

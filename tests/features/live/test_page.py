@@ -250,6 +250,23 @@ def test_where_no_page_can_be_served_is_refused(
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_an_interrupt_before_a_page_is_opened_says_that_nothing_was_flown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flight waits for a page; the command prints the text of the interrupt."""
+
+    def interrupted(pace: Pace, session: Session, page: Page) -> None:
+        assert pace.waiting
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Pace, "drive", interrupted)
+    saved = tmp_path / "saved"
+    with pytest.raises(KeyboardInterrupt, match=r"^no page was opened, .*: nothing was flown, and nothing is written$"):
+        main(["live", "hover", "--no-browser", "--set", "controller.horizon=5", "--out", str(saved)])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_an_interrupt_keeps_what_was_flown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
