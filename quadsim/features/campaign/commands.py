@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from quadsim.scenarios.schema.scenario import Scenario
 
     CampaignName: TypeAlias = ScenarioName
-    Draws: TypeAlias = Sequence[Mapping[str, Any]]
+    Variations: TypeAlias = Sequence[Mapping[str, Any]]
 else:
     from quadsim.features.arguments import one_of
 
     CampaignResult = PairedComparison = Replay = Any
     CampaignName = one_of(campaign_names)
-    Draws = Annotated[Any, Parameter(parse=False)]
+    Variations = Annotated[Any, Parameter(parse=False)]
 
 _log: Final = logging.getLogger("quadsim")
 
@@ -114,7 +114,7 @@ def campaign(
     junit: File | None = None,
     changes: Changes = (),
     seed: Whole | None = None,
-    vary: Draws = (),
+    vary: Variations = (),
     fields: Fields = None,
     controller: UserCode = None,
     forces: UserForces = (),
@@ -210,7 +210,7 @@ def campaign(
 
 def _scenario_plan(
     scenario: Scenario,
-    vary: Draws,
+    vary: Variations,
     fields: Fields,
     controller: UserCode,
     forces: UserForces,
@@ -311,9 +311,9 @@ def owns(directory: Path) -> bool:
 
 def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
     """Draw a campaign's flights for a scenario that need not be its own; see `quadsim.features.campaign.plan`."""
-    from quadsim.features.campaign.plan import drawn_flights as draw
+    from quadsim.features.campaign.plan import plan_for_scenario
 
-    return draw(scenario, vary)
+    return plan_for_scenario(scenario, vary)
 
 
 def check_advice(directory: File) -> str:

@@ -425,7 +425,7 @@ def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], objec
                 raise InputError(message) from None
 
 
-def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
+def plan_for_scenario(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
     """The draws of a campaign, with its `[set]`, for a scenario that need not be its own.
 
     Args:

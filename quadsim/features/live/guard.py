@@ -3,7 +3,7 @@
 Viser has no hook for this, and a second server in front of it would leave its own port open to every page that finds
 it.  So the guard stands where viser's server is made, in the function `serve` of the public module
 `websockets.asyncio.server`, which checks each request before viser sees it.  A viser that makes its server in another
-way would be unguarded: `Guard.require_closed` therefore tries the door before anything is shown, and refuses.
+way would be unguarded: `RequestGuard.require_closed` therefore tries the door before anything is shown, and refuses.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ANSWER_TIME: Final = 10.0  # [s] for an answer of this process
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
-class Guard:
+class RequestGuard:
     """Checks requests to a server that listens on a host; the address has to have its `token`.
 
     A browser lets any site connect to servers on the loopback interface, so that each request is checked: `Host`

@@ -29,7 +29,7 @@ from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.live import readout
 from quadsim.features.live.controller_tab import ControllerTab
 from quadsim.features.live.disturb_tab import disturb
-from quadsim.features.live.guard import Guard
+from quadsim.features.live.guard import RequestGuard
 from quadsim.features.live.incoming import Incoming
 from quadsim.features.live.look import dressed
 from quadsim.features.live.pace import Pace
@@ -106,7 +106,7 @@ class Page:
         self._pace = pace
         self._save = save
         title = f"quadsim live: {session.scenario.name}"
-        guard = Guard(host)
+        guard = RequestGuard(host)
         listening = self._serve(guard, title, host, port)
         self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._driver: int | None = None
@@ -135,7 +135,7 @@ class Page:
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._left)
 
-    def _serve(self, guard: Guard, title: str, host: str, port: int) -> int:
+    def _serve(self, guard: RequestGuard, title: str, host: str, port: int) -> int:
         """Start the server, which a guard has to protect; return its port.
 
         Raises:

@@ -1,8 +1,8 @@
 """The margins of a loop: up to which value of each quantity it is stable, by bisection.
 
 From the nominal value p0 a search goes outwards to the first value at which the growth |d(t)| ~ exp(rate t) of
-`quadsim.rollout.growth` is not negative, then halves the bracket until it is `WIDTH` wide: as a share of the margin
-|p - p0|, or as a logarithm where p is a factor.  `quantities` says what p is, `report` shows what was found.
+`quadsim.rollout.growth` is not negative, then halves the bracket until it is `BRACKET_WIDTH` wide: as a share of the
+margin |p - p0|, or as a logarithm where p is a factor.  `quantities` says what p is, `report` shows what was found.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from quadsim.scenarios.plugin import Plugin
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.ties import first_smallest
 
-WIDTH: Final = 0.02
+BRACKET_WIDTH: Final = 0.02
 """Width of the last bracket: as a share of a margin, or of the value where this is a factor."""
 _OUTWARD_SHARES: Final = (1.0 / 16.0, 1.0 / 8.0, 1.0 / 4.0, 1.0 / 2.0, 1.0)
 """Of the way to the end of a range, where a search looks first: a loop may be stable again beyond an unstable value."""
@@ -198,7 +198,7 @@ def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], floa
 
 
 def _is_wide(value_at: Callable[[float], float], inner: float, outer: float, *, geometric: bool) -> bool:
-    """Return whether a bracket, in shares of the way, is wider than `WIDTH`."""
+    """Return whether a bracket, in shares of the way, is wider than `BRACKET_WIDTH`."""
     if outer - inner < _NARROWEST:
         return False
     low = value_at(inner)
@@ -206,8 +206,8 @@ def _is_wide(value_at: Callable[[float], float], inner: float, outer: float, *, 
     if value_at(0.5 * (inner + outer)) in (low, high):
         return False
     if geometric:
-        return abs(math.log(high / low)) > WIDTH
-    return abs(high - low) > WIDTH * abs(high - value_at(0.0))
+        return abs(math.log(high / low)) > BRACKET_WIDTH
+    return abs(high - low) > BRACKET_WIDTH * abs(high - value_at(0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
