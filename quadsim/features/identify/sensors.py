@@ -1,7 +1,7 @@
-"""Samples that a sensor, a counter or a radio spoilt: jumps away and back, counters that stop, rows that are held.
+"""Samples that a sensor, a counter or a radio corrupted: jumps away and back, counters that stop, rows that are held.
 
-A jump is farther from the median about it than 1.5 ranges of all medians.  Such samples are cut before `record` samples
-anything anew, averages or fits it, and a note names sensor, time and value; a sensor that fails too often makes the log
+A jump is farther from the median about it than 1.5 ranges of all medians.  Such samples are cut before `record`
+resamples and averages anything, and a note names sensor, time and value; a sensor that fails too often makes the log
 one that cannot be used.
 """
 
@@ -20,8 +20,8 @@ from quadsim.state import Array
 
 LONGEST_SPIKE: Final = 3  # samples, of which a log with a sample in `SPIKE_TIME` or more has one
 SPIKE_TIME: Final = 0.03  # [s]: what lasts longer may be flown
-FARTHEST: Final = 1.5  # how far a sample may be from the median about it, in ranges of all medians
-LOUDEST: Final = 8.0  # the same in median distances, where a column hardly changes
+SPIKE_OVER_RANGE: Final = 1.5  # how far a sample may be from the median about it, in ranges of all medians
+SPIKE_OVER_NOISE: Final = 8.0  # what it may be farther, in median distances: a column may hardly change
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
 LEAST_DROP: Final = 0.05  # share of a battery's voltage below which a change is no jump: it is logged to 0.1 V
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
@@ -110,7 +110,7 @@ def _spike_note(name: str, field: str, samples: Column, column: int, spikes: NDA
     if count > MOST_CUT * len(spikes):
         raise InputError(
             f"{what}, far from the samples beside; at most {MOST_CUT:.0%} of a sensor's samples may jump:"
-            " mend or leave out that sensor"
+            " correct or leave out that sensor"
         )
     return f"{what}, far from the samples beside: left out"
 
@@ -143,7 +143,7 @@ def _column_spikes(samples: Column, *, command: bool = False, least: float = 0.0
         spikes[there] = np.abs(rows) > COMMANDS_APART * np.abs(middle).max()
         return spikes
     distance = np.abs(rows - middle)
-    farthest = FARTHEST * np.ptp(middle, axis=0) + LOUDEST * np.median(distance, axis=0)
+    farthest = SPIKE_OVER_RANGE * np.ptp(middle, axis=0) + SPIKE_OVER_NOISE * np.median(distance, axis=0)
     farthest = np.maximum(farthest, least * np.abs(middle).max(axis=0))
     spikes[there] = distance > farthest + ROUNDING
     return spikes
@@ -285,9 +285,9 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
             f"t = {t[row]:.6g} s on while the others turn at {others:.4g}, in {share:.1%} of the time that they turn"
         )
         if share > MOST_STOPPED:
-            advice = "mend it"
+            advice = "correct it"
             if "commands" in series or "throttle" in series:
-                advice = "mend it, or name the commands alone"
+                advice = "correct it, or name the commands alone"
             raise InputError(f"{what}: its counter is dead, at most {MOST_STOPPED:.0%} is allowed: {advice}")
         notes.append(f"{what}: left out")
     result["speeds"] = Column(t=t, values=values)
