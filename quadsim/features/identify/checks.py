@@ -172,7 +172,7 @@ def _advised(record: Record) -> str:
 
 
 def _logged(record: Record) -> NDArray[np.bool_]:
-    """Rows (N,) in no gap."""
+    """Rows (N,) without a gap in any field."""
     logged = np.ones(len(record.t), bool)
     for name in ("velocity", "attitude", "rates", "position", *ROTOR_INPUTS):
         rows = getattr(record, name)
@@ -184,7 +184,7 @@ def _logged(record: Record) -> NDArray[np.bool_]:
 def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDArray[np.bool_]:
     """Rows (N,) on the ground or near it; gaps are bridged by a straight line.
 
-    A log that rests under constant outputs, but for a second, never flies.
+    A log with less than a second of motion or of changing outputs has no flight: all its rows at rest are returned.
     """
     velocity = _bridged(record.velocity, logged)
     attitude = _bridged(record.attitude, logged)
@@ -203,7 +203,7 @@ def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDAr
     supported = np.abs(acceleration[:, 2]) < SUPPORTED * lacking * gravity
     resting = calm & (lacking > LEAST_LACKING) & supported
     eighth = second // 8
-    lasting = minimum_filter1d(resting.astype(np.int8), 2 * eighth + 1)  # not the top of a climb
+    lasting = minimum_filter1d(resting.astype(np.int8), 2 * eighth + 1)  # the top of a climb does not last
     margin = round(GROUND_MARGIN * second)
     return np.asarray(maximum_filter1d(lasting, 2 * (margin + eighth) + 1) > 0)
 
@@ -308,7 +308,7 @@ def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
 
 
 class RowCheck(NamedTuple):
-    """What has to hold of a log's complete rows before it is asked when it flies."""
+    """What has to hold of a log's complete rows; it is checked before the parts in the air are sought."""
 
     holds: str
     run: Callable[[Record, NDArray[np.bool_]], None]  # raises InputError where it does not

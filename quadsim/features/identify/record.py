@@ -219,14 +219,13 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     for field, column in moving.items():
         values[field] = _sampled(column, grid, held=field in HELD_INPUTS)
     _normalise_rows(values["attitude"])
+    velocity_period = _usual_period(moving["velocity"].t)
     if inertial:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
-    elif force is not None:
-        velocity_period = _usual_period(moving["velocity"].t)
-        if velocity_period > SLOWEST_VELOCITY:
-            values["velocity"] = _filled_by_force(name, values, force, grid, velocity_period)
-            rate = 1.0 / velocity_period
-            notes.append(f"{name}: the velocity is logged at {rate:.3g} Hz; the accelerometer fills it in")
+    elif force is not None and velocity_period > SLOWEST_VELOCITY:
+        values["velocity"] = _filled_by_force(name, values, force, grid, velocity_period)
+        rate = 1.0 / velocity_period
+        notes.append(f"{name}: the velocity is logged at {rate:.3g} Hz; the accelerometer fills it in")
     if voltage is not None:
         there = np.isfinite(voltage.values[:, 0])
         if there.any():

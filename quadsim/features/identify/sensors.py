@@ -36,7 +36,7 @@ SLOWS_DOWN: Final = 0.1  # [s] for which such a command must last
 MOST_STOPPED: Final = 0.05  # share of the flight in which a counter may have stopped
 ROUNDING: Final = 1e-9  # [rad, rad/s, m/s]: below it, nothing has changed
 SLOWEST_FRESH: Final = 20.0  # [Hz] at which rows must be new
-HELD_TOO: Final = 0.9  # share of the held rows in which a column repeats that is held with them
+HELD_TOO: Final = 0.9  # share of the held rows in which a column repeats, from which on it counts as held too
 
 
 class _Sensor(NamedTuple):
@@ -176,8 +176,8 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
 def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
     """Return the series of a log without rows that a radio held: rates and attitude as in the row before.
 
-    A series `fresh` says which rows are new, and of which something of the rotors is known; the others are NaN, of
-    commands that were held with them linear.
+    A series `fresh` has two columns of 1 and 0: whether a row is new, and whether it has new values of the rotors.
+    Held rows are NaN, but for commands that were held too, which are interpolated.
 
     Raises:
         InputError: fewer than `SLOWEST_FRESH` rows per second are new.
@@ -240,8 +240,9 @@ def _fresh_rate(series: Mapping[str, Column], repeated: NDArray[np.bool_]) -> fl
 def at_rest(still: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
     """Steps (N - 1,) at which a vehicle rests, of those at which nothing turns.
 
-    A row that is held is followed by one that has moved, and a row that is held again: it is between steps that turn.
-    Rest lasts from the log's first step on, or to its last, or longer than `longest` steps until more than one turns.
+    A radio that holds rows repeats each a few times, with single steps that turn in between.  A vehicle rests in a run
+    of still steps that includes the log's first or last one, or is longer than `longest` with two turning steps on
+    both sides.
     """
     rest = np.zeros_like(still)
     for run in runs(still):

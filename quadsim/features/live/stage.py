@@ -231,15 +231,15 @@ class Stage:
 
         The scene moves instead of the camera: the first vehicle stays in the middle, and a viewer may turn it.
         """
-        tape: Any = WebsockMessageHandler()  # takes the place of a server
-        tape.get_message_buffer = lambda: SimpleNamespace(push=lambda message: None)
-        record = tape.get_message_serializer(lambda message: message.include_in_scene_serialization)
-        camera = viser.InitialCameraConfig(tape.queue_message)
+        messages: Any = WebsockMessageHandler()  # takes the place of a server
+        messages.get_message_buffer = lambda: SimpleNamespace(push=lambda message: None)
+        record = messages.get_message_serializer(lambda message: message.include_in_scene_serialization)
+        camera = viser.InitialCameraConfig(messages.queue_message)
         camera.position = self.unit * VIEW
         camera.look_at = np.zeros(3)
         camera.fov = FIELD
         lock = SimpleNamespace(_scene_lifecycle_lock=threading.RLock())
-        owner: Any = SimpleNamespace(_websock_connection=tape, client_id="", _viser_server=lock)
+        owner: Any = SimpleNamespace(_websock_connection=messages, client_id="", _viser_server=lock)
         frames = list(self._shown)
         idle = SimpleNamespace()
         stage = Stage(viser.SceneApi(owner, idle, idle), self._session)
@@ -248,7 +248,7 @@ class Stage:
             stage._root.position = -stage.pose(frame, 1.0)
             record.insert_sleep(self._session.period)
             clock.sleep(_PAUSE)
-        return look.dressed(record.as_html(), title)
+        return look.adapted_page(record.as_html(), title)
 
     def _line(self, name: str, points: Array, colour: Rgb, thickness: float = 3.0) -> Any:
         style = {"thickness": thickness, "thickness_units": "screen"}
