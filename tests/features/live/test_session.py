@@ -212,7 +212,7 @@ def test_a_lost_flight_ends_the_session_with_its_reason(session: Session) -> Non
     assert same_bits(session)
 
 
-def test_knobs_have_units_and_limits() -> None:
+def test_tunable_fields_have_units_and_limits() -> None:
     result = {field.path: field for field in tunable_fields(load_scenario("robust").controller)}
     assert result["horizon"].minimum == 1
     assert result["output_bounds.roll"].value == (-5.0, 5.0)
