@@ -92,12 +92,12 @@ class Plan:
         drawn: set[str] = set()
         for entry in self.spec.vary:
             drawn.update(entry.fields)
-        draws_it = not drawn.isdisjoint(("controller", "controller.type", "forces"))
-        return draws_it or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
+        may_be_drawn = not drawn.isdisjoint(("controller", "controller.type", "forces"))
+        return may_be_drawn or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
 
     @property
     def columns(self) -> dict[str, pa.DataType]:
-        """The columns that events may be about, with their types: all but clock times and what only counts flights."""
+        """The columns that events may be about, with their types: not clock times, nor a flight's number and seed."""
         others = {*TIMES, "flight", "seed", "failed"}
         return {field.name: field.type for field in self.schema if field.name not in others}
 
@@ -398,7 +398,7 @@ def _scaled(scenario: Scenario, tables: dict[str, Any], entry: Varied, field: st
         InputError: there is no such field, or one of the two is no number.
     """
     modelled = get_field(tables, field)
-    if modelled is None:  # refused with its own message where there is no such field
+    if modelled is None:  # setting a field that does not exist raises the message on it
         with_drawn_values(scenario, [(replace(entry, relative=False), value)], {}, table=table)
     owner = f"{table}.{entry.name}"
     if not _is_number(modelled):

@@ -200,8 +200,8 @@ def _format_of(file: Path) -> LogFormat:
 def to_record(name: str, series: Mapping[str, Column]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
-    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
-    has no gaps: it changes slowly; nor has `flying`, which changes rarely.
+    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. Gaps of the
+    voltage, which changes slowly, and of `flying`, which changes rarely, are bridged.
     """
     logged = dict(series)
     flying = logged.pop("flying", None)
@@ -236,7 +236,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         values["rotors_unknown"] = np.full(len(grid), 1.0 - known_rotors.mean())
     grid, values, averaged = _at_fastest_rate(name, grid, values)
     notes += averaged
-    if "fresh" in values:
+    if "fresh" in values:  # a mean over rows of which any is new counts as new
         values["fresh"] = values["fresh"] > 0.0
         values["rotors_unknown"] = float(values["rotors_unknown"][0])
     if flying is not None:

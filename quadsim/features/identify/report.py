@@ -64,7 +64,7 @@ class IdentifiedVehicle(Tabular):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The vehicle as its file has it, but for rounding."""
+        """The vehicle of the file, before its numbers are rounded."""
         return self.identification.vehicle
 
     @property
@@ -215,7 +215,10 @@ class IdentifiedVehicle(Tabular):
         if self.page is not None:
             yield console.to_open(self.page)
         if self.file is None:
-            yield f"no vehicle file was written: --out mine.toml{' --anyway' * bool(self.prediction.lost)} writes it"
+            options = "--out mine.toml"
+            if self.prediction.lost:
+                options += " --anyway"
+            yield f"no vehicle file was written: {options} writes it"
         elif not self.prediction.lost:
             yield console.command(f"{console.to_open(self.file, 'quadsim scenario --for')} > first.toml")
             settings = [f" --set {shlex.quote(f'{field}={value}')}" for field, value in self.settings.items()]
@@ -340,6 +343,7 @@ def _fit_and_predict(
 
 
 def _refuse_same_flights(logs: Sequence[_Usable]) -> None:
+    """Refuse two logs with the same body rates, which would count twice."""
     for one, other in itertools.combinations(logs, 2):
         if np.array_equal(one.record.rates, other.record.rates):
             raise InputError(f"{one.record.name} and {other.record.name} are the same flight: name it once")
