@@ -58,11 +58,8 @@ IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""
 HANDING_OUT = ("quadsim", "quadsim.mpc", "quadsim.gym")
 """Modules with a table of public names, each imported on first use; `quadsim` also starts the command."""
-DEFINED_TWICE = {
-    *("Draws", "Guard", "MOST_ROWS", "NUMBER", "Overlay", "Solving", "TARGETS", "WIDTH"),
-    *("drawn_flights", "export", "fly", "load_vehicle", "main"),
-}
-"""Public names that two modules define, for two things or as a function and its command; no name joins them."""
+DEFINED_TWICE = {"export", "fly", "load_vehicle", "main"}
+"""Public names that two modules define, as a function and its command; no name joins them."""
 FORMULAS_TWICE = {("quadsim_nonlinear.c", "quadsim_rotation.h")}
 """C files that share a formula: the angles of a quaternion, as a controller is exported without the plant's headers."""
 

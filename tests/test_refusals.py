@@ -568,7 +568,11 @@ def test_every_command_reports_it_once_and_writes_nothing(
         ("quadsim.assets.LARGEST_TOML", 20, "@x.toml: must be of 20 or fewer bytes; got 30"),
         ("quadsim.scenarios.courses.csv_course.LARGEST_CSV", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
         ("quadsim.assets.MOST_ASSIGNMENTS", 1, "@x.toml: must assign at most 1 values; it has 2 equals signs"),
-        ("quadsim.scenarios.courses.csv_course.MOST_ROWS", 1, "@x.csv: must have 1 or fewer rows below its header"),
+        (
+            "quadsim.scenarios.courses.csv_course.MOST_COURSE_ROWS",
+            1,
+            "@x.csv: must have 1 or fewer rows below its header",
+        ),
     ],
 )
 def test_a_file_that_is_too_large_is_not_read(

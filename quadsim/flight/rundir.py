@@ -23,7 +23,7 @@ from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import file_hashes
 from quadsim.space import shape_from_json, shape_to_json
 
-NUMBER: Final = (int, float)
+JSON_NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
 _SUMMARY_TYPES: Final = {
     "scenario": str,
@@ -32,7 +32,7 @@ _SUMMARY_TYPES: Final = {
     "format": int,
     "reason": (str, NoneType),
     "satisfied": bool,
-    "duration": NUMBER,
+    "duration": JSON_NUMBER,
     "constraints": list,
     "tracking": dict,
     "control": dict,
@@ -45,10 +45,10 @@ _CONSTRAINT_TYPES: Final = {
     "name": str,
     "signal": str,
     "unit": str,
-    "tolerance": NUMBER,
-    "tolerance_sampled": NUMBER,
-    "start": NUMBER,
-    "time_violated": NUMBER,
+    "tolerance": JSON_NUMBER,
+    "tolerance_sampled": JSON_NUMBER,
+    "start": JSON_NUMBER,
+    "time_violated": JSON_NUMBER,
     "required": bool,
     "satisfied": bool,
     "lower": MAYBE_NUMBER,

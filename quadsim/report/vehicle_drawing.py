@@ -17,7 +17,7 @@ from quadsim.report.to_matplotlib import figure_file, write_figure
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
-WIDTH: Final = 5.5  # of a file [in]
+DRAWING_WIDTH: Final = 5.5  # of a file [in]
 _HEIGHT: Final = 4.0  # of the panel, which makes it about square
 _ARC: Final = np.radians(np.linspace(0.0, 270.0, 61))  # angles along the arrow that shows how a rotor turns
 _ARROW_RADIUS: Final = 0.82  # of that arrow, over the propeller's
@@ -32,7 +32,7 @@ def drawing_file(path: Path | str, *, overwrite: bool = False) -> Path:
 
 def write_drawing(vehicle: Vehicle, path: Path, *, overwrite: bool = False) -> None:
     """Write the drawing as PDF, SVG or PNG; errors as `quadsim.report.to_matplotlib.write_figure`."""
-    write_figure(vehicle_figure(vehicle), path, width=WIDTH, overwrite=overwrite)
+    write_figure(vehicle_figure(vehicle), path, width=DRAWING_WIDTH, overwrite=overwrite)
 
 
 def vehicle_figure(vehicle: Vehicle) -> Figure:

@@ -13,7 +13,7 @@ from support import NO_PRODUCTS, fly_here
 import quadsim
 from quadsim.commands.app import run
 from quadsim.errors import InputError
-from quadsim.features.campaign.plan import drawn_flights, make_plan
+from quadsim.features.campaign.plan import make_plan, plan_for_scenario
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import scenario_names
 from quadsim.scenarios.feasibility_check import floor_notes
@@ -70,8 +70,8 @@ def test_every_way_to_other_fields_gives_the_same_scenario(eight: Scenario, tmp_
         "printed": load_scenario(str(printed)),
         "campaign": make_plan(eight, {"flights": 1, "vary": vary}).of(0),
         "campaign of a flight": make_plan(flown, {"flights": 1, "vary": vary}).of(0),
-        "vary": drawn_flights(eight, str(campaign)).of(0),
-        "set": drawn_flights(eight, str(changed)).of(0),
+        "vary": plan_for_scenario(eight, str(campaign)).of(0),
+        "set": plan_for_scenario(eight, str(changed)).of(0),
     }
     durations = {way: scenario.duration for way, scenario in ways.items()}
     assert durations == dict.fromkeys(ways, longer(eight, 3.0))

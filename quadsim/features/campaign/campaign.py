@@ -152,30 +152,30 @@ def fly_campaign(
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     engine = "local" if cluster is None else "dask"
-    session = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
+    entry = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
     if is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     code_digest()  # kept: a process that dies before its manifest is there could not be resumed
     with growing(directory, MANIFEST_FILE, overwrite=overwrite, first=(CAMPAIGN_FILE, SCENARIO_FILE)) as files:
         if is_campaign(directory):
             require_same(plan, directory)
-        flying = _Session(plan, files, until_width=until_width, watch=watch)
-        manifest = start_session(plan, files, session, flying=bool(flying.missing))
-        if flying.missing:
+        session = _Session(plan, files, until_width=until_width, watch=watch)
+        manifest = start_session(plan, files, entry, flying=bool(session.missing))
+        if session.missing:
             files.remove(REPORT_FILES)  # an earlier report lacks the flights to come
         try:
-            flying.fly(workers, cluster)
+            session.fly(workers, cluster)
         except BaseException:
             manifest["status"] = "interrupted"
             raise
         finally:
-            session["flights"] = flying.flown
-            session["wall_s"] = clock.perf_counter() - flying.started
-            manifest["flown"] = int(np.count_nonzero(flying.outcomes[: flying.needed] >= 0))
+            entry["flights"] = session.flown
+            entry["wall_s"] = clock.perf_counter() - session.started
+            manifest["flown"] = session.completed
             write_manifest(manifest, files)
 
-        table, summary = _close(plan, flying, manifest, files)
-        files.finish(summary, unhashed=UNREPRODUCIBLE)
+        table, summary = _close(plan, session, manifest, files)
+        files.finish(summary, unhashed=UNREPRODUCIBLE)  # complete already, should the report fail
         with optional("the report"):
             if report:
                 _replace_report(files, table, summary, plan.spec)
@@ -186,7 +186,7 @@ def fly_campaign(
 
 
 class _Session:
-    """A session of flying: the rows on disk, the missing flights, and when there are enough of them."""
+    """One call of `fly_campaign`: it flies the flights that are not on disk yet, until there are enough of them."""
 
     def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
         self._plan = plan
@@ -194,8 +194,8 @@ class _Session:
         self._watch = watch
         self.store = Store(files, plan.schema)
         self.needed = plan.spec.flights  # fewer once the interval is narrow enough
-        self.flown = 0
-        self._checked = 0
+        self.flown = 0  # in this session
+        self._checked = 0  # number of first flights after which the interval was last checked
         self.started = clock.perf_counter()
         self.outcomes = np.full(plan.spec.flights, -1, np.int8)  # -1 not flown, 0 passed, 1 failed
         stored = self.store.table()
@@ -203,8 +203,13 @@ class _Session:
         self.outcomes[stored["flight"].to_numpy()] = stored["failed"].to_numpy(zero_copy_only=False)
 
     @property
+    def completed(self) -> int:
+        """Number of the needed flights that have been flown, in earlier sessions too."""
+        return int(np.count_nonzero(self.outcomes[: self.needed] >= 0))
+
+    @property
     def missing(self) -> list[int]:
-        """Return the missing flights."""
+        """The flights that are still to be flown; none if the interval is narrow enough."""
         if self._is_narrow_enough():
             return []
         return list(np.flatnonzero(self.outcomes < 0).tolist())
@@ -213,7 +218,7 @@ class _Session:
         """Fly missing flights until the campaign is complete or the interval is narrow enough.
 
         Raises:
-            InputError: it is so before flights that a finished campaign has.
+            InputError: the interval is narrow enough after fewer flights than a finished campaign has.
         """
         missing = self.missing
         counted = self.store.counted()
@@ -247,31 +252,31 @@ class _Session:
             return False
         if self.needed < self.outcomes.size:
             return True
-        without_gap = int(np.argmax(np.append(self.outcomes, -1) < 0))
-        every = math.lcm(CHECK_EVERY, self._plan.spec.cells)  # whole turns of the grids
+        without_gap = int(np.argmax(np.append(self.outcomes, -1) < 0))  # how many flights precede the first gap
+        every = math.lcm(CHECK_EVERY, self._plan.spec.cells)  # each combination of the grids equally often
         for count in range(self._checked + every, without_gap + 1, every):
             self._checked = count
             failures = int(np.count_nonzero(self.outcomes[:count] == 1))
-            share = proportion(failures, count)
-            if share["upper"] - share["lower"] <= self._width:
+            estimated = proportion(failures, count)
+            if estimated["upper"] - estimated["lower"] <= self._width:
                 self.needed = count
                 return True
         return False
 
 
-def _close(plan: Plan, flying: _Session, manifest: dict[str, Any], files: Growing) -> tuple[pa.Table, dict[str, Any]]:
+def _close(plan: Plan, session: _Session, manifest: dict[str, Any], files: Growing) -> tuple[pa.Table, dict[str, Any]]:
     """Write the final tables and the manifest of them; return the table of flights and its summary.
 
     Raises:
         OutputError: they cannot be written.
     """
-    table, times = flying.store.close(flying.needed)
+    table, times = session.store.close(session.needed)
     summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, "failure": [*plan.spec.failure]}
     summary |= estimate(table, plan.limits)
-    # flights by the processor that flew them; those that raised, or that no process came back from, have none
+    # Number of flights by processor; a flight that raised or whose process died has none.
     processors = times["machine"].drop_null().to_pylist()
     manifest["machines"] = dict(sorted(Counter(processors).items()))
-    if flying.needed == plan.spec.flights:
+    if session.needed == plan.spec.flights:
         manifest["status"] = "complete"
     else:
         manifest["status"] = "stopped"
@@ -281,7 +286,7 @@ def _close(plan: Plan, flying: _Session, manifest: dict[str, Any], files: Growin
 
 
 def _replace_report(files: Growing, table: pa.Table, summary: CampaignSummary, spec: CampaignFile) -> None:
-    """Write the report in place of an earlier one, of which no file stays.
+    """Write the report, and remove all files of an earlier one.
 
     Raises:
         OutputError: it cannot be written.
@@ -301,7 +306,7 @@ class Recorded:
     row: Mapping[str, Any]  # of `flights.parquet`
     plan: Plan
     scenario: Scenario
-    notes: Sequence[str]  # reasons for which its numbers may differ when it is flown again
+    notes: Sequence[str]  # reasons why its numbers may differ when it is flown again
 
 
 def recorded_flight(directory: Path, number: int | None) -> Recorded:

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.features.campaign.campaign_file import CampaignFile
-from quadsim.features.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, parse_event
+from quadsim.features.campaign.events import ALL_SATISFIED, INCOMPLETE, UNAUDITED, VERDICTS, parse_event
 from quadsim.features.campaign.rows import (
     DRAW,
     MARGIN,
@@ -61,7 +61,7 @@ _TITLES: Final = {
 }
 _CONSOLE_LINES: Final = 8  # of a table on the console; the report has them all
 _CONSOLE_WIDTH: Final = 60  # characters of a line's last cell on the console
-_VERDICT_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN, UNAUDITED: Mark.WARN}  # of others: bad
+_VERDICT_MARKS: Final = {ALL_SATISFIED: Mark.NONE, INCOMPLETE: Mark.WARN, UNAUDITED: Mark.WARN}  # of others: bad
 _ALWAYS_LISTED: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, TypeAlias
 
 from cyclopts import Parameter
 
@@ -32,6 +32,8 @@ from quadsim.features.arguments import (
 from quadsim.scenarios.catalogue import campaign_names
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from quadsim.features.campaign.campaign import CampaignResult, Replay, Watch
     from quadsim.features.campaign.paired import PairedComparison
     from quadsim.features.campaign.plan import Plan
@@ -40,13 +42,13 @@ if TYPE_CHECKING:
     from quadsim.scenarios.schema.scenario import Scenario
 
     CampaignName: TypeAlias = ScenarioName
-    Draws: TypeAlias = Sequence[Mapping[str, Any]]
+    Variations: TypeAlias = Sequence[Mapping[str, Any]]
 else:
     from quadsim.features.arguments import one_of
 
     CampaignResult = PairedComparison = Replay = Any
     CampaignName = one_of(campaign_names)
-    Draws = Annotated[Any, Parameter(parse=False)]
+    Variations = Annotated[Any, Parameter(parse=False)]
 
 _log: Final = logging.getLogger("quadsim")
 
@@ -114,7 +116,7 @@ def campaign(
     junit: File | None = None,
     changes: Changes = (),
     seed: Whole | None = None,
-    vary: Draws = (),
+    vary: Variations = (),
     fields: Fields = None,
     controller: UserCode = None,
     forces: UserForces = (),
@@ -164,23 +166,14 @@ def campaign(
     from quadsim.console.results import after
     from quadsim.features.campaign.campaign import fly_campaign
     from quadsim.features.campaign.events import parse_event
-    from quadsim.features.campaign.plan import load_plan
     from quadsim.features.campaign.statistics import judge, parse_requirement
     from quadsim.outputs import absolute
-    from quadsim.scenarios.schema.scenario import Scenario
 
     if junit is not None and not require:
         raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it writes")
     verdict_file = None if junit is None else junit_file(junit)
     requirements = [parse_requirement(text) for text in require]
-    if isinstance(campaign, Scenario):
-        if changes:
-            raise InputError("changes apply to a campaign file; change a scenario by its replace")
-        plan = _scenario_plan(campaign, vary, fields, controller, forces, flights=flights, seed=seed)
-    elif vary or fields or controller is not None or forces:
-        raise InputError("vary, controller, forces and fields apply to a scenario; a campaign file sets them itself")
-    else:
-        plan = load_plan(str(campaign), list(changes), flights=flights, seed=seed)
+    plan = _plan_of(campaign, changes, vary, fields, controller, forces, flights=flights, seed=seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
     if resume and overwrite:
@@ -208,9 +201,10 @@ def campaign(
     return result
 
 
-def _scenario_plan(
-    scenario: Scenario,
-    vary: Draws,
+def _plan_of(
+    campaign: CampaignName,
+    changes: Changes,
+    vary: Variations,
     fields: Fields,
     controller: UserCode,
     forces: UserForces,
@@ -218,7 +212,30 @@ def _scenario_plan(
     flights: Whole | None,
     seed: Whole | None,
 ) -> Plan:
-    """Return the campaign of a scenario that is given in Python, of the settings that are stated."""
+    """Return the plan of a campaign file, or of a scenario with what is drawn for it."""
+    from quadsim.features.campaign.plan import load_plan
+    from quadsim.scenarios.schema.scenario import Scenario
+
+    if isinstance(campaign, Scenario):
+        if changes:
+            raise InputError("changes apply to a campaign file; change a scenario by its replace")
+        return _scenario_plan(campaign, vary, fields, controller, forces, flights=flights, seed=seed)
+    if vary or fields or controller is not None or forces:
+        raise InputError("vary, controller, forces and fields apply to a scenario; a campaign file sets them itself")
+    return load_plan(str(campaign), list(changes), flights=flights, seed=seed)
+
+
+def _scenario_plan(
+    scenario: Scenario,
+    vary: Variations,
+    fields: Fields,
+    controller: UserCode,
+    forces: UserForces,
+    *,
+    flights: Whole | None,
+    seed: Whole | None,
+) -> Plan:
+    """Return the plan of a scenario given in Python; settings that are None have the defaults of a campaign file."""
     from quadsim.features.campaign.plan import make_plan
     from quadsim.scenarios.user_code import importable
 
@@ -311,9 +328,9 @@ def owns(directory: Path) -> bool:
 
 def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
     """Draw a campaign's flights for a scenario that need not be its own; see `quadsim.features.campaign.plan`."""
-    from quadsim.features.campaign.plan import drawn_flights as draw
+    from quadsim.features.campaign.plan import plan_for_scenario
 
-    return draw(scenario, vary)
+    return plan_for_scenario(scenario, vary)
 
 
 def check_advice(directory: File) -> str:
@@ -344,39 +361,32 @@ def compare_directories(
     from quadsim.console.results import after
     from quadsim.features.campaign.paired import compare_pairs
     from quadsim.features.campaign.plan import plan_differences
-    from quadsim.features.campaign.reaudit import judged_by
-    from quadsim.features.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
     from quadsim.flight.audit import limit_differences
     from quadsim.report.comparison import check_names
     from quadsim.rollout.flight_comparison import place_of
 
     if len(directories) != 2:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
-    first, second = directories
-    first_plan = stored_plan(first)
-    second_plan = stored_plan(second)
+    first = _read_finished(directories[0])
+    second = _read_finished(directories[1])
     check_names(names, 2)
     if names:
         names = (names[0], names[1])
     else:
-        names = (first_plan.spec.name, second_plan.spec.name)
-    first_table = read_flights(first / FLIGHTS_FILE, first_plan.schema)
-    second_table = read_flights(second / FLIGHTS_FILE, second_plan.schema)
-    first_limits = _audited_limits(first_plan)
-    second_limits = _audited_limits(second_plan)
+        names = (first.plan.spec.name, second.plan.spec.name)
     audits: list[str] = []
     if constraints is None:
-        audits = limit_differences(first_limits, second_limits)
+        audits = limit_differences(first.limits, second.limits)
     else:  # both are judged by the same limits
-        limits = (first_limits, second_limits)[place_of(constraints, directories)]
-        first_table = judged_by(limits, first_limits, first_table, first_plan.failure)
-        second_table = judged_by(limits, second_limits, second_table, second_plan.failure)
+        limits = (first.limits, second.limits)[place_of(constraints, directories)]
+        first = first.judged_by(limits)
+        second = second.judged_by(limits)
     comparison = compare_pairs(
-        first_table,
-        second_table,
+        first.table,
+        second.table,
         names,
-        failures=(first_plan.spec.failure, second_plan.spec.failure),
-        differences=plan_differences(first_plan, second_plan),
+        failures=(first.plan.spec.failure, second.plan.spec.failure),
+        differences=plan_differences(first.plan, second.plan),
         audits=audits,
     )
     if out is None:
@@ -385,6 +395,25 @@ def compare_directories(
         return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))
 
 
-def _audited_limits(plan: Plan) -> tuple[Limit, ...]:
-    """Return the limits of a campaign's audit with both tolerances stated."""
-    return tuple(limit.with_tolerances() for limit in plan.limits)
+class _FinishedCampaign(NamedTuple):
+    """A campaign as its directory has it."""
+
+    plan: Plan
+    table: pa.Table  # `flights.parquet`
+    limits: tuple[Limit, ...]  # of its audit, with both tolerances stated
+
+    def judged_by(self, limits: Sequence[Limit]) -> _FinishedCampaign:
+        """The same with the verdicts that other limits give."""
+        from quadsim.features.campaign.reaudit import judged_by
+
+        return self._replace(table=judged_by(limits, self.limits, self.table, self.plan.failure))
+
+
+def _read_finished(directory: Path) -> _FinishedCampaign:
+    """Read a campaign directory."""
+    from quadsim.features.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
+
+    plan = stored_plan(directory)
+    table = read_flights(directory / FLIGHTS_FILE, plan.schema)
+    limits = tuple(limit.with_tolerances() for limit in plan.limits)
+    return _FinishedCampaign(plan, table, limits)

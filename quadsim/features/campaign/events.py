@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 FlightFlags = np.ndarray[Any, np.dtype[np.bool_]]
-HARMLESS: Final = "satisfied"
+ALL_SATISFIED: Final = "satisfied"
 INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad
 UNAUDITED: Final = "unaudited"  # of a flight without any constraint: it shows no violation, and not that there is none
 
@@ -38,7 +38,7 @@ class VerdictMeaning(NamedTuple):
 
 
 VERDICTS: Final = {
-    HARMLESS: VerdictMeaning(0, COLOUR.satisfied, "circle"),
+    ALL_SATISFIED: VerdictMeaning(0, COLOUR.satisfied, "circle"),
     INCOMPLETE: VerdictMeaning(1, COLOUR.warning, "cross"),
     UNAUDITED: VerdictMeaning(1, COLOUR.measured, "circle-open"),
     "violated": VerdictMeaning(2, COLOUR.violated, "diamond"),
@@ -50,7 +50,7 @@ VERDICTS: Final = {
 }
 """In the order in which they are drawn and counted."""
 
-_VERDICT_EVENTS: Final = [verdict for verdict in VERDICTS if verdict not in (HARMLESS, "violated")]
+_VERDICT_EVENTS: Final = [verdict for verdict in VERDICTS if verdict not in (ALL_SATISFIED, "violated")]
 """Verdicts that are events; `violated` has a column of its own, which counts lost flights too."""
 _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "failure": ("failed", True),

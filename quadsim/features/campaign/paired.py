@@ -267,40 +267,7 @@ class PairedComparison(Tabular):
 
     def records(self) -> list[dict[str, Any]]:
         """Return a row per event, its shares of the pairs, and per metric, its means; `p_holm` is of events alone."""
-        rows: list[dict[str, Any]] = []
-        for event in self.events:
-            first, second = event.counts
-            rows.append(
-                {
-                    "kind": "event",
-                    "name": event.event,
-                    "unit": "-",
-                    "pairs": event.pairs,
-                    "first": first / event.pairs,
-                    "second": second / event.pairs,
-                    "difference": event.difference,
-                    "lower": None,
-                    "upper": None,
-                    "p_holm": event.p_holm,
-                }
-            )
-        for metric in self.metrics:
-            difference = metric.difference
-            rows.append(
-                {
-                    "kind": "metric",
-                    "name": metric.name,
-                    "unit": metric.unit,
-                    "pairs": difference.pairs,
-                    "first": metric.mean_a,
-                    "second": metric.mean_b,
-                    "difference": difference.mean,
-                    "lower": difference.lower,
-                    "upper": difference.upper,
-                    "p_holm": None,
-                }
-            )
-        return rows
+        return [*map(_event_row, self.events), *map(_metric_row, self.metrics)]
 
     def to_markdown(self) -> str:
         """Return verdict, tables and differences as Markdown."""
@@ -359,6 +326,40 @@ class PairedComparison(Tabular):
             "events": {event.event: asdict(event) for event in self.events},
             "metrics": {metric.name: asdict(metric) for metric in self.metrics},
         }
+
+
+def _event_row(event: EventComparison) -> dict[str, Any]:
+    """Return an event's row of `PairedComparison.records`."""
+    first, second = event.counts
+    return {
+        "kind": "event",
+        "name": event.event,
+        "unit": "-",
+        "pairs": event.pairs,
+        "first": first / event.pairs,
+        "second": second / event.pairs,
+        "difference": event.difference,
+        "lower": None,
+        "upper": None,
+        "p_holm": event.p_holm,
+    }
+
+
+def _metric_row(metric: MetricComparison) -> dict[str, Any]:
+    """Return a metric's row of `PairedComparison.records`."""
+    difference = metric.difference
+    return {
+        "kind": "metric",
+        "name": metric.name,
+        "unit": metric.unit,
+        "pairs": difference.pairs,
+        "first": metric.mean_a,
+        "second": metric.mean_b,
+        "difference": difference.mean,
+        "lower": difference.lower,
+        "upper": difference.upper,
+        "p_holm": None,
+    }
 
 
 def compare_pairs(

@@ -1,4 +1,4 @@
-"""A campaign ready to fly: its file and scenario, which define the scenario and the row of each flight.
+"""A campaign ready to fly: its file and scenario, from which the scenario and the row of each flight follow.
 
 A flight's scenario is the campaign's with the drawn values in its fields (`with_drawn_values`); where an entry is
 relative, a drawn value multiplies the scenario's own.  `campaign_file` draws, `campaign` flies the plan, `rows` has the
@@ -61,7 +61,7 @@ class Plan:
 
     spec: CampaignFile  # the file
     scenario: Scenario  # with the file's changes, and the numbers of its vehicle's file recorded
-    one_seed: bool = False  # whether all flights have the scenario's own, as in a sweep
+    one_seed: bool = False  # whether all flights have the scenario's seed, as in a sweep
 
     @property
     def _table(self) -> str:
@@ -83,7 +83,7 @@ class Plan:
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
-        """The limits of the audit, those of a user's controller too; flights for which bounds are drawn have others."""
+        """The limits of the audit, those of a user's controller too; where bounds are drawn, a flight has its own."""
         return Assembly(self.scenario).audited().limits
 
     @property
@@ -92,12 +92,12 @@ class Plan:
         drawn: set[str] = set()
         for entry in self.spec.vary:
             drawn.update(entry.fields)
-        draws_it = not drawn.isdisjoint(("controller", "controller.type", "forces"))
-        return draws_it or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
+        may_be_drawn = not drawn.isdisjoint(("controller", "controller.type", "forces"))
+        return may_be_drawn or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
 
     @property
     def columns(self) -> dict[str, pa.DataType]:
-        """The columns that events may be about, with their types: all but clock times and what only counts flights."""
+        """The columns that events may be about, with their types: not clock times, nor a flight's number and seed."""
         others = {*TIMES, "flight", "seed", "failed"}
         return {field.name: field.type for field in self.schema if field.name not in others}
 
@@ -134,10 +134,10 @@ class Plan:
         """Refuse, before the first flight, values that cannot be flown.
 
         Raises:
-            InputError: a value of an entry of `[[vary]]`, at the end of its range, cannot be flown; none of the first
+            InputError: a value at the end of the range of an entry of `[[vary]]` cannot be flown; none of the first
                 flights can; or a failure event is about a column that the results do not have.
         """
-        _ = self.failure  # refused where it is no list of events
+        _ = self.failure  # its first access refuses texts that are no events
 
         def check_one(entry: Varied, value: Value) -> None:
             checked(Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)))
@@ -159,7 +159,7 @@ class Plan:
             flown = fly_for_table(self.of(flight))
         except QuadsimError as error:
             return self.failed(flight, str(error))
-        if flown.log.traceback:  # no more of such a flight is kept than that it raised
+        if flown.log.traceback:  # a flight that raised has no other results
             reason = str(flown.log.reason)
             if flown.log.traceback[-1].startswith(MemoryError.__name__):
                 return self.failed(flight, f"{reason} (it may take {self.spec.limits.memory:g} MB)", MEMORY)
@@ -210,7 +210,10 @@ class Plan:
         return row | {"failed": failed}
 
     def _varied(self, changes: Sequence[DrawnChange], *, name: str, seed: int) -> Scenario:
-        """Return the scenario with drawn values; where the vehicle is drawn, relative values are shares of its own."""
+        """Return the scenario with drawn values; where the vehicle is drawn, relative values are multiples of its own.
+
+        The drawn vehicle is therefore set first, and its numbers recorded, before the other values are.
+        """
         scenario = self.scenario
         vehicles = []
         for entry, value in changes:
@@ -349,19 +352,23 @@ def table_value(value: Value) -> Value | str:
 def with_drawn_values(
     scenario: Scenario, changes: Sequence[DrawnChange], identity: Mapping[str, Any], *, table: str
 ) -> Scenario:
-    """A scenario with the fields of some entries replaced; `table` of the file has the entries.
+    """A scenario with the fields of some entries replaced.
 
-    `identity` has its name and seed, which no description lists.
+    Args:
+        scenario: the scenario.
+        changes: entries with their drawn values.
+        identity: the new name and seed; empty to keep both.
+        table: name of the file's table with the entries, for messages.
 
     Raises:
-        InputError: what comes of it is no scenario.
+        InputError: the changed fields make no valid scenario.
     """
     tables = scenario.tables
     defaults = plain(scenario)
     for entry, _ in changes:
         for field in entry.fields:
             _state_actual(field, tables, defaults)
-    modelled = merge(defaults, {})  # a copy, as looking up a field makes the tables on its way
+    modelled = merge(defaults, {})  # a copy, as `get_field` adds the tables on the path to a field
     for entry, value in changes:
         for field, single in separate({tuple(entry.fields): value}, source=table).items():
             if entry.relative:
@@ -373,7 +380,7 @@ def with_drawn_values(
 
 
 def _state_actual(field: str, tables: dict[str, Any], defaults: dict[str, Any]) -> None:
-    """Give a field of `[actual]` the vehicle's value, in place: it is as modelled until it is drawn."""
+    """Set a field of `[actual]` to the vehicle's value, in place, so that a relative draw has a number to multiply."""
     above, *names = field.split(".")
     if above != "actual" or not names:
         return
@@ -391,7 +398,7 @@ def _scaled(scenario: Scenario, tables: dict[str, Any], entry: Varied, field: st
         InputError: there is no such field, or one of the two is no number.
     """
     modelled = get_field(tables, field)
-    if modelled is None:  # refused with its own message where there is no such field
+    if modelled is None:  # setting a field that does not exist raises the message on it
         with_drawn_values(scenario, [(replace(entry, relative=False), value)], {}, table=table)
     owner = f"{table}.{entry.name}"
     if not _is_number(modelled):
@@ -425,13 +432,13 @@ def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], objec
                 raise InputError(message) from None
 
 
-def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
+def plan_for_scenario(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
     """The draws of a campaign, with its `[set]`, for a scenario that need not be its own.
 
     Args:
         scenario: the scenario that they vary.
         vary: the campaign's name or file; or entries as of its `[[vary]]`, of which `DEFAULT_FLIGHTS` flights are
-            drawn, or more to have each combination of grids as often as another.
+            drawn, or more, so that each combination of grids is flown equally often.
 
     Raises:
         InputError: there is no such campaign, or what it draws cannot be flown.
@@ -450,7 +457,7 @@ def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -
 
 
 def _grid_size(entry: Any) -> int:
-    """Number of a grid's values, 1 of another entry; what is wrong with an entry is told when it is parsed."""
+    """Number of a grid's values, 1 of another entry; an entry that is wrong is refused when it is parsed."""
     if not isinstance(entry, Mapping) or entry.get("distribution") != "grid":
         return 1
     values = entry.get("values")

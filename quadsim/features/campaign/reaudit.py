@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
-from quadsim.features.campaign.events import HARMLESS, INCOMPLETE, CountedEvent, FlightFlags
+from quadsim.features.campaign.events import ALL_SATISFIED, INCOMPLETE, CountedEvent, FlightFlags
 from quadsim.features.campaign.rows import MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, flags, null, numbers, texts
 from quadsim.flight.audit import Limit, limit_differences
 
@@ -47,9 +47,9 @@ def judged_by(
             all_held &= held | unknown
             all_reached &= ~unknown
     verdict = texts(table, "verdict")
-    by_audit = np.isin(verdict.astype(str), (HARMLESS, "violated", INCOMPLETE))
+    by_audit = np.isin(verdict.astype(str), (ALL_SATISFIED, "violated", INCOMPLETE))
     failed_by = ~null(table, "failed_by")
-    audit_verdict = np.where(failed_by | ~all_held, "violated", np.where(all_reached, HARMLESS, INCOMPLETE))
+    audit_verdict = np.where(failed_by | ~all_held, "violated", np.where(all_reached, ALL_SATISFIED, INCOMPLETE))
     verdicts = np.where(by_audit, audit_verdict, verdict)
     violated = np.where(by_audit, verdicts == "violated", flags(table, "violated", absent=True))
     table = _with_column(table, "verdict", verdicts)

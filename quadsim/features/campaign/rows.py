@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from quadsim.controller import ACCEPTED, NO_SOLVER, Phase
 from quadsim.errors import FileError
-from quadsim.features.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, CountedEvent, FlightFlags
+from quadsim.features.campaign.events import ALL_SATISFIED, INCOMPLETE, UNAUDITED, VERDICTS, CountedEvent, FlightFlags
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit, worst_finding, worst_share
 from quadsim.flight.log import FlightLog
@@ -112,7 +112,7 @@ def flown_row(
         "status": log.status,
         "verdict": verdict,
         "reason": reason or log.reason,
-        "violated": verdict not in (HARMLESS, INCOMPLETE, UNAUDITED),
+        "violated": verdict not in (ALL_SATISFIED, INCOMPLETE, UNAUDITED),
         "failed_by": metrics.failure(log.control),
         "crashed": log.control.crashed,
         "duration": round(float(log.plant.t[-1]), 9),
@@ -237,7 +237,7 @@ def reached(table: pa.Table, name: str) -> FlightFlags:
 
     Lost flights and those that raised an error or met a limit had to get there, so they count: they did not hold it.
     """
-    had_to = ~np.isin(texts(table, "verdict").astype(str), (HARMLESS, INCOMPLETE, UNAUDITED, "violated"))
+    had_to = ~np.isin(texts(table, "verdict").astype(str), (ALL_SATISFIED, INCOMPLETE, UNAUDITED, "violated"))
     return np.asarray(~null(table, SATISFIED + name) | had_to, bool)
 
 

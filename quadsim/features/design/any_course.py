@@ -161,7 +161,7 @@ def fitted_course(
         allowed=allowed,
         own=own,
     )
-    return _written(name, size, base, assembly, samples, adaptation)
+    return _first_course(name, size, base, assembly, samples, adaptation)
 
 
 def _has_obstacles(base: Scenario) -> bool:
@@ -384,7 +384,7 @@ def _motion(samples: SampledCourse, length: float, time: float, response_time: f
     return velocity, (stated - velocity) / lag
 
 
-def _written(
+def _first_course(
     name: str,
     size: float | None,
     base: Scenario,
@@ -409,16 +409,11 @@ def _written(
     tables = _space(base, scale, explained)
     if _touches_ground(base):
         tables = _ground(base, assembly) + tables
-    has_floor = _touches_ground(base)
-    required = allowed  # 0 where its own constraints limit the errors
-    constraints = ""
-    for entry in base.constraints:
-        if _is_floor(entry):
-            has_floor = True
-        if entry.signal in _CARRIED and entry.has_bounds:
-            constraints += _constraint(entry, adaptation)
-            if entry.signal in _ERRORS:
-                required = 0.0
+    carried = [entry for entry in base.constraints if entry.signal in _CARRIED and entry.has_bounds]
+    constraints = "".join([_constraint(entry, adaptation) for entry in carried])
+    required = allowed
+    if any(entry.signal in _ERRORS for entry in carried):
+        required = 0.0  # its own constraints limit the errors
     stem = Path(name).stem
     about = stem
     if samples.moves:
@@ -438,7 +433,7 @@ def _written(
         why_allowed=f"{100 * ALLOWED_SHARE:g} % of its own figure eight, {in_digits(allowed / ALLOWED_SHARE):g} m",
         lasts=samples.moves and not samples.jumps,
         clearance=_clearance(base, scale),
-        has_floor=has_floor,
+        has_floor=_touches_ground(base) or any(map(_is_floor, base.constraints)),
         tables=tables,
         constraints=constraints,
         notes=(*_scale_notes(adaptation), *_left_out(base)),

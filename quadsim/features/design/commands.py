@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from cyclopts import Parameter
 
@@ -24,8 +24,11 @@ if TYPE_CHECKING:
     from quadsim.console.results import Document
     from quadsim.features.design.vehicle_report import VehicleReport
     from quadsim.scenarios.loading import ScenarioFile
+    from quadsim.vehicle import Vehicle
 else:
     Document = ScenarioFile = VehicleReport = Any
+
+_TEMPLATE: Final = Path(__file__).with_name("vehicle_template.toml")
 
 
 def scenario(
@@ -184,13 +187,12 @@ def vehicle_report(
     from quadsim.assets import vehicle_path
     from quadsim.console import results
 
-    blank = Path(__file__).with_name("vehicle_template.toml")
     if thrust_stand is not None:
         for option, value in {"--template": template, "--scenario": scenario}.items():
             if value:
                 raise ParameterError("", "--thrust-stand", str(thrust_stand), f"given without {option}")
         if name is None:
-            start = blank
+            start = _TEMPLATE
         else:
             start = vehicle_path(str(name))
         return _by_stand(Path(thrust_stand), start, rotors, diameter, out, overwrite=overwrite)
@@ -198,47 +200,56 @@ def vehicle_report(
         if number is not None:
             raise ParameterError("", option, number, "given with --thrust-stand alone")
     if template:
-        return results.Document(blank.read_text(encoding="utf-8"))
+        return results.Document(_TEMPLATE.read_text(encoding="utf-8"))
     if name is None:
         names = ", ".join(vehicle_names())
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
-    return _vehicle_report(vehicle_path(str(name)), scenario, out, overwrite=overwrite)
+    return _drawn_report(vehicle_path(str(name)), scenario, out, overwrite=overwrite)
 
 
-def _vehicle_report(path: Path, scenario: ScenarioName | None, out: File | None, *, overwrite: bool) -> VehicleReport:
+def _drawn_report(path: Path, scenario: ScenarioName | None, out: File | None, *, overwrite: bool) -> VehicleReport:
     """Return the report of a vehicle's file, and draw the vehicle to `out`; see `vehicle_report`."""
     from quadsim.console import results
-    from quadsim.features.design import shortfalls, vehicle_report
+    from quadsim.features.design import shortfalls
     from quadsim.report import vehicle_drawing
     from quadsim.scenarios import loading
-    from quadsim.scenarios.assembly import stated_autopilot
-    from quadsim.sim.autopilot import AutopilotSettings
-    from quadsim.vehicle import example_notes, load_vehicle, vehicle_sources
+    from quadsim.vehicle import load_vehicle
 
-    loaded = load_vehicle(path)
+    vehicle = load_vehicle(path)
     compared = None
     if scenario is not None:
         compared = loading.load_scenario(scenario)
     picture = None
     if out is not None:
         picture = vehicle_drawing.drawing_file(out, overwrite=overwrite)
-    autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
-    report = vehicle_report.VehicleReport(
-        vehicle=loaded,
-        sources=vehicle_sources(path),
-        leftovers=example_notes(path),
-        autopilot=autopilot,
-        inner_lag=vehicle_report.inner_lag_of(loaded, autopilot),
-        figures=vehicle_report.make_sheet(loaded),
-    )
+    report = _report_on(path, vehicle)
     if compared is not None:
-        missed = shortfalls.shortfalls(compared, loaded)
+        missed = shortfalls.shortfalls(compared, vehicle)
         report = replace(report, scenario=compared.name, shortfalls=missed)
     if picture is None:
         return report
     with results.after(report, picture):
-        vehicle_drawing.write_drawing(loaded, picture, overwrite=overwrite)
+        vehicle_drawing.write_drawing(vehicle, picture, overwrite=overwrite)
     return replace(report, picture=picture)
+
+
+def _report_on(path: Path, vehicle: Vehicle) -> VehicleReport:
+    """Return the report on a vehicle and its file, compared with no scenario."""
+    from quadsim.features.design import vehicle_report
+    from quadsim.scenarios.assembly import stated_autopilot
+    from quadsim.sim.autopilot import AutopilotSettings
+    from quadsim.vehicle import example_notes, vehicle_sources
+
+    settings = stated_autopilot(path) or AutopilotSettings()
+    autopilot = settings.resolved(vehicle)
+    return vehicle_report.VehicleReport(
+        vehicle=vehicle,
+        sources=vehicle_sources(path),
+        leftovers=example_notes(path),
+        autopilot=autopilot,
+        inner_lag=vehicle_report.inner_lag_of(vehicle, autopilot),
+        figures=vehicle_report.make_sheet(vehicle),
+    )
 
 
 def _by_stand(
@@ -254,7 +265,7 @@ def _by_stand(
         raise ParameterError("", "--rotors", rotors, f"1 or {N_ROTORS}")
     if diameter is not None and not 0.0 < diameter < math.inf:
         raise ParameterError("", "--diameter", diameter, "above 0, in m")
-    if start.name != "vehicle_template.toml":
+    if start.name != _TEMPLATE.name:
         load_vehicle(start)
     if out is not None and Path(out).suffix != ".toml":
         raise ParameterError("", "--out", str(out), "a .toml file with --thrust-stand")

@@ -29,7 +29,7 @@ from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.preflight import checked
 from quadsim.scenarios.scaling import Scale, scaled_limit, scaled_table
 from quadsim.scenarios.schema.scenario import Scenario
-from quadsim.scenarios.schema.writing import WIDTH, plain
+from quadsim.scenarios.schema.writing import LINE_WIDTH, plain
 
 DEFAULT_MARGIN: Final = 0.1  # default share of half a band that is left
 LARGEST_MARGIN: Final = 0.9
@@ -163,7 +163,7 @@ def at_fastest(first: FirstScenario, fastest: FastestCourse) -> FirstScenario:
     _, made_by, rest = document.as_string().split("\n", 2)
     head = f"# A first flight of {printable(description)}.\n{made_by} --fastest --margin {fastest.margin:g}\n"
     for sentence in fastest.lines:
-        for line in textwrap.wrap(sentence, WIDTH - 2):
+        for line in textwrap.wrap(sentence, LINE_WIDTH - 2):
             head += f"# {line}\n"
     return replace(first, text=head + rest)
 

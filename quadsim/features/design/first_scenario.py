@@ -35,9 +35,9 @@ DISTURBANCE_UNITS: Final = {
     "force_noise": "N s^0.5, white, each axis",
     "torque_noise": "N m s^0.5, white, each axis",
     "force_deviation": "N, standard deviation, world x, y, z",
-    "force_time": "s, with which it is forgotten",
+    "force_time": "s, time constant with which it decays",
     "torque_deviation": "N m, standard deviation, body x, y, z",
-    "torque_time": "s, with which it is forgotten",
+    "torque_time": "s, time constant with which it decays",
 }
 """What a disturbance has, and in which unit."""
 
@@ -136,7 +136,7 @@ def _notes(vehicle: Vehicle, design: Design, course: FirstCourse, law: str) -> s
     if law == "robust":
         subject = "The loop's bandwidth for x and y"
         closing = (
-            f"Without bounds it tolerates {1e3 * delay_margin(vehicle, design):.3g} ms more delay than it knows of.\n"
+            f"Without bounds it tolerates {1e3 * delay_margin(vehicle, design):.3g} ms more delay than its model has.\n"
             "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; sources: quadsim/features/design/rules.py."
         )
     else:

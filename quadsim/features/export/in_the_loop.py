@@ -161,7 +161,7 @@ class QueryKind(IntEnum):
     STAND = 3  # the same while the ground holds the vehicle, which shows no disturbance
 
 
-Solving = Literal[QueryKind.STEP, QueryKind.STAND]
+SolvingQuery = Literal[QueryKind.STEP, QueryKind.STAND]
 
 
 class Reply(NamedTuple):
@@ -228,7 +228,9 @@ class SerialMPC:
         self._speeds = np.array(speeds, float)
         self._window = np.zeros((0, 0))
 
-    def step(self, time: float, state: Array, reference: Array, acting: Array, kind: Solving = QueryKind.STEP) -> Reply:
+    def step(
+        self, time: float, state: Array, reference: Array, acting: Array, kind: SolvingQuery = QueryKind.STEP
+    ) -> Reply:
         """The answer at t_k [s] to x(k), the reference and u(k-1) (4,), as the exported controller takes them.
 
         Where the reference is the last one moved on, its last row alone is sent.
@@ -299,7 +301,7 @@ class MPCInTheLoop:
                 self._before = self._bounds.lowest(acting)
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
-        kind: Solving = QueryKind.STAND
+        kind: SolvingQuery = QueryKind.STAND
         if now.phase is Phase.FLYING:
             kind = QueryKind.STEP
         if self._whole:

@@ -1,4 +1,4 @@
-"""A scenario as a Gymnasium environment: the plant, sensors, air and audit of `quadsim run`, an agent in the loop.
+"""A scenario as a Gymnasium environment: plant, sensors, wind and audit as in `quadsim run`, with an agent in the loop.
 
 A step is one control period: an action becomes a command (`spaces.py`), the loop of `quadsim.rollout` flies it, and the
 observation, the reward (`rewards.py`) and the margins follow.  `episodes.py` draws what an episode flies; many
@@ -27,7 +27,7 @@ from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.margins import Margins, violated
-from quadsim.sim.physics import Observation
+from quadsim.sim.physics import Observation, Period
 from quadsim.state import INDEX, Array
 
 
@@ -38,15 +38,15 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     by a criterion of `[lost]`, has crashed, or has diverged, and truncated at the scenario's duration, which a
     campaign's `[set]` may change.
 
-    A pickled or copied environment is without its episode, whose plant is native memory: reset it first.
+    A pickled or copied environment has no episode, as the plant of one is native memory: reset it first.
 
     `info` at each step, and at the start:
 
-    - `margins`: signed margin of each constraint at its worst within the step, at the physics rate, or at the samples
-      where its signal has no others (tracking errors, `slew`), in the constraint's unit; negative = beyond the bound,
-      inf outside its time window.
-    - `margins_sampled`: the margins at the end of the step, as a check at the control rate sees them.
-    - `constraint_values`: (m,) g = -margin in the order of `constraint_names`, so that g <= 0 holds; -inf outside.
+    - `margins`: worst signed margin of each constraint within the step, in the constraint's unit; negative = beyond the
+      bound, inf outside its time window.  It is taken at the physics rate, or at the control rate where the signal has
+      no other samples (tracking errors, `slew`).
+    - `margins_sampled`: the margins at the end of the step, as a check at the control rate has them.
+    - `constraint_values`: (m,) g = -margin in the order of `constraint_names`, so that satisfied means g <= 0.
     - `constraint_violation`: 1 where a required constraint was violated beyond its tolerances, else 0.
     - `cost`: number of required constraints violated.
     - `time` [s], `phase` (`flying`, `landed`, ...), `reason` (why the flight ended; empty until then).
@@ -113,19 +113,14 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._base = self.episodes.base
         if render_mode not in (None, "rgb_array"):
             raise ParameterError("", "render_mode", render_mode, "rgb_array or None")
-        horizon = self._base.controller.horizon
-        if preview is None:
-            preview = horizon
-        if not (isinstance(preview, int | np.integer) and 1 <= preview <= horizon):
-            raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
+        self.preview = _observed_periods(preview, self._base.controller.horizon)
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
-        self.observations = Observations(observation, preview)
+        self.observations = Observations(observation, self.preview)
         self.actions = Actions(action, self._base, Assembly(self._base).vehicle)
         self.action_space = self.actions.space
         self.observation_space = self.observations.space
         self.render_mode = render_mode
         self._size = (width, height)
-        self.preview = preview
         self._reward = RewardHook(reward)
         self._action = action
         self._flight: Rollout | None = None
@@ -141,7 +136,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     @property
     def outcome(self) -> tuple[Array, Array, Array]:
-        """What the last step's reward depends on: true state (12,), reference (4,), commanded speeds (4,) [rad/s]."""
+        """The arguments of the last step's reward: true state (12,), reference (4,), commanded speeds (4,) [rad/s]."""
         acting = self._seen.moment.acting
         assert acting is not None
         return self._truth, self._seen.reference, acting
@@ -164,15 +159,15 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what is native memory or a process: the episode and the renderer."""
-        return {**self.__dict__, "_flight": None, "_camera": None, "_answered": None}
+        return {**self.__dict__, "_flight": None, "_camera": None, "_substitute": None}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode.
 
         Args:
             seed: the scenario's, as of `quadsim run --seed`.  Without one the first episode has the scenario's own, and
-                each further one a seed drawn from the last that was given.  Where something varies, it is what the
-                campaign's flight is drawn from.
+                the seeds of later ones are drawn from the last that was given.  With `vary`, the flight of the campaign
+                is drawn from it.
             options: `flight`, the number of a flight of the campaign that varies something.
 
         Raises:
@@ -188,7 +183,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return self.start(self.episodes.draw(seed, options or {}, self.np_random))
 
     def replay(self, episode: Episode, actions: Iterable[Action]) -> Flight:
-        """Fly an episode by these actions, to their end or its own; return its flight.
+        """Fly an episode by these actions until they, or the episode, end; return its flight.
 
         Raises:
             ClosedEnvironmentError: `close` has been called.
@@ -217,7 +212,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._flight = Rollout(assembly, controller)
         self.limits = self._flight.limits
         self._margins = Margins(self.limits, scenario.plant.timestep)
-        self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
+        self._substitute: tuple[int, Action, Command] | None = None  # period, action, and what it flies
         self._seen = self._flight.observation
         self._truth = self._seen.truth
         self._over = False
@@ -245,16 +240,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             sample = flight.loop.step(command)
         except FlightError:
             self._over = True
-            nothing = np.full(len(self.limits), np.inf)
-            return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
-        try:
-            self._seen = flight.loop.observation
-            self._truth = self._seen.truth
-        except FlightError:  # lost: no controller would be called any more
-            self._truth = flight.loop.truth
-            rows = flight.loop.followed(float(self._truth[INDEX["yaw"]]))
-            moment = replace(seen.moment, acting=sample.speeds)
-            self._seen = replace(seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
+            unlimited = np.full(len(self.limits), np.inf)
+            return self._vector(seen), 0.0, True, False, self._info(unlimited, unlimited)
+        self._observe(sample)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
         worst, sampled = self._margins.of_period(sample)
         info = self._info(worst, sampled)
@@ -263,34 +251,46 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         truncated = self._over and not terminated
         return self._vector(self._seen), reward, terminated, truncated, info
 
+    def _observe(self, sample: Period) -> None:
+        """Observe the vehicle after a period [k, k + 1]; one that is lost is not measured, and has its true state."""
+        loop = self.started.loop
+        try:
+            self._seen = loop.observation
+            self._truth = self._seen.truth
+        except FlightError:  # lost: a controller would not be called again
+            self._truth = loop.truth
+            rows = loop.followed(float(self._truth[INDEX["yaw"]]))
+            moment = replace(self._seen.moment, acting=sample.speeds)
+            self._seen = replace(self._seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
+
     def _command(self, action: Action) -> Command:
-        """Return the command of an action: the controller's where it answered with this very action in this period."""
+        """Return the command of an action, or the one that `fly_instead` has set for it in this period."""
         flight = self.started
-        if self._answered is not None:
-            period, answer, command = self._answered
-            if period == flight.k and np.array_equal(answer, action):
+        if self._substitute is not None:
+            period, replaced, command = self._substitute
+            if period == flight.k and np.array_equal(replaced, action):
                 return command
         yaw = float(self._seen.state[INDEX["yaw"]])
         return self.actions.command(action, flight.loop.controller.horizon, yaw)
 
     def controller_action(self) -> Action:
-        """Return the command of the scenario's controller at this time, computed once per period.
+        """Return the action equivalent to the command of the scenario's controller now; it is computed once per period.
 
-        Where that very action is taken next, the controller's command is flown to the bit, with its plan and status:
-        such an episode is the flight of `quadsim run`.
+        If `step` is given exactly this action next, it flies the controller's command itself, with its plan and status:
+        an episode of such actions is the flight of `quadsim run`, bit for bit.
 
         Raises:
-            ParameterError: actions are thrust and rates, which a controller does not answer with.
-            FlightError: the controller has no answer; a flight of its own would end here.
+            ParameterError: actions are thrust and rates, to which rotor speeds are not converted.
+            FlightError: the controller has no command; a flight of `quadsim run` would end here.
             ClosedEnvironmentError: `close` has been called.
         """
         self.require_open()
         flight = self.started
-        if self._answered is not None:
-            period, answer, _ = self._answered
+        if self._substitute is not None:
+            period, action, _ = self._substitute
             if period == flight.k:
-                return answer
-        self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
+                return action
+        self.actions.of(np.zeros(4))  # raises if actions have no equivalent rotor speeds, before anything is computed
         agent = flight.loop.controller
         if isinstance(agent, Agent):
             flight.loop.controller = Assembly(self.scenario).controller()
@@ -312,8 +312,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return action
 
     def fly_instead(self, action: Action, command: Command) -> None:
-        """Let an action, if it is the next one, fly this command of rotor speeds, with its plan and status."""
-        self._answered = (self.started.k, action, command)
+        """Set the command of rotor speeds that `step` flies, with its plan and status, if its action is this one."""
+        self._substitute = (self.started.k, action, command)
 
     def flight(self) -> Flight:
         """Return the episode so far as an audited flight, which can be saved and plotted.
@@ -349,7 +349,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._camera = None
 
     def _vector(self, seen: Observation) -> Array:
-        """Return the observation; beyond its end the reference keeps its last value."""
+        """Return the observation; a reference that ends earlier than the preview keeps its last value."""
         rows = seen.preview
         acting = seen.moment.acting
         assert acting is not None
@@ -379,7 +379,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
 
 class Agent:
-    """Placeholder for a controller where actions fly; the scenario's controller is built when first needed."""
+    """Takes the controller's place while actions fly; `controller_action` builds the scenario's when first needed."""
 
     name = "agent"
     solver = ""
@@ -394,3 +394,12 @@ class Agent:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Never called: each step has a command."""
         raise NotImplementedError
+
+
+def _observed_periods(preview: int | None, horizon: int) -> int:
+    """Return the observed periods of the reference, by default the controller's horizon."""
+    if preview is None:
+        return horizon
+    if not (isinstance(preview, int | np.integer) and 1 <= preview <= horizon):
+        raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
+    return preview

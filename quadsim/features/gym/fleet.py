@@ -372,6 +372,24 @@ class Together:
         """See `Fleet`."""
         batch = self._batch
         commands = action_commands(self._action, self._scale, actions, self._state[:, _YAW])
+        places = self._fly(commands, flying, frame)
+        self._follow(places)
+        for place, error in self._lost(places).items():
+            self._state[place] = batch.state[place]
+            self._follow(np.array([place]))
+            frame.terminated[place] = True
+            frame.reasons[place] = str(error)
+        frame.observations[places] = self._observe(places)
+        frame.time[:] = self._k * self._period
+        self._fill_margins(places, frame)
+        margins = dict(zip(self._names, frame.smallest.T, strict=False))
+        rewards = self._rewards.of_many(batch.state.copy(), self._followed[:, 0].copy(), batch.acting.copy(), margins)
+        frame.rewards[places] = rewards[places]
+        frame.truncated[places] = (self._k[places] >= self._periods[places]) & ~frame.terminated[places]
+
+    def _fly(self, commands: Array, flying: Flags, frame: StepResults) -> NDArray[np.intp]:
+        """Fly a control period, with measurements where there are sensors; return the places whose flight goes on."""
+        batch = self._batch
         batch.reference[:] = self._followed[:, 0]
         batch.measured[:] = self._state
         sensed = [i for i in self._sensed if flying[i]]
@@ -393,19 +411,7 @@ class Together:
                 navigation = self._navigation(place)
                 navigation.record(batch.flown(place))
                 self._state[place] = navigation.state()
-        self._follow(places)
-        for place, error in self._lost(places).items():
-            self._state[place] = batch.state[place]
-            self._follow(np.array([place]))
-            frame.terminated[place] = True
-            frame.reasons[place] = str(error)
-        frame.observations[places] = self._observe(places)
-        frame.time[:] = self._k * self._period
-        self._fill_margins(places, frame)
-        margins = dict(zip(self._names, frame.smallest.T, strict=False))
-        rewards = self._rewards.of_many(batch.state.copy(), self._followed[:, 0].copy(), batch.acting.copy(), margins)
-        frame.rewards[places] = rewards[places]
-        frame.truncated[places] = (self._k[places] >= self._periods[places]) & ~frame.terminated[places]
+        return places
 
     def _end(self, place: int, error: FlightError, frame: StepResults) -> None:
         """Fill in the row of a place whose flight ended within the period, which is not part of it."""

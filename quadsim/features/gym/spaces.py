@@ -31,7 +31,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle, span
 Action = NDArray[np.floating]
 
 ACTIONS: Final = ("deviations", "rotors", "speeds", "thrust", "rates", "attitude")
-TARGETS: Final = ("rates", "attitude")
+AUTOPILOT_ACTIONS: Final = ("rates", "attitude")
 """The actions that are targets of an autopilot."""
 PARTS: Final = ("state", "preview", "ahead", "command")
 USUAL: Final = ("state", "preview", "command")
@@ -90,7 +90,7 @@ class Actions:
             hover_bounds = [float(low[0]), float(high[0])]
             raise ParameterError(owner, "speed", hover_bounds, f"below and above the hover speed, {span(hover)} rad/s")
         self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
-        if kind in TARGETS:
+        if kind in AUTOPILOT_ACTIONS:
             self._settings = _rate_loop(scenario.plant.timestep)
             self._speeds = float(low[0]), float(high[0])
             hover = np.array(vehicle.mass * vehicle.gravity)
@@ -180,7 +180,7 @@ class Actions:
         Raises:
             ParameterError: actions are not rotor speeds.
         """
-        if self.kind in TARGETS:
+        if self.kind in AUTOPILOT_ACTIONS:
             rule = "deviations, speeds or thrust: rotor speeds are no target to hold"
             raise ParameterError("", "action", self.kind, rule)
         if self.kind == "speeds":
@@ -250,7 +250,7 @@ def action_commands(kind: str, scale: Mapping[str, Array], actions: Array, yaw: 
     """
     if kind == "speeds":
         return actions
-    if kind in TARGETS:
+    if kind in AUTOPILOT_ACTIONS:
         return _targets_of(kind, scale, actions, yaw)
     amounts = scale["hover"] + actions * np.where(actions < 0.0, scale["down"], scale["up"])
     if kind == "thrust":

@@ -101,6 +101,9 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         _require_whole("threads", threads)
         if max_episode_steps is not None:
             _require_whole("max_episode_steps", max_episode_steps)
+        rewards = RewardHook(reward)
+        if rewards.takes_margins and not margins:
+            raise ParameterError("", "margins", margins, "True for a reward with a parameter margins")
         if render_mode is not None:
             rule = "None: envs.flight(i).save(directory) films an episode of environment i"
             raise ParameterError("", "render_mode", render_mode, rule)
@@ -119,15 +122,9 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.render_mode = None
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
-        self.obstacle = obstacle_to_batch(self.scenario)
-        compiled = Margins(self._single.limits, self.scenario.plant.timestep).compiled
-        if self.obstacle is None and margins and not compiled:
-            self.obstacle = "a constraint whose margins Python computes"
+        self.obstacle = self._obstacle_to_batch(margins=margins)
         entries = len(self.observations.layout)
         self._frame = StepResults.empty(self.num_envs, entries, len(self.constraint_names))
-        rewards = RewardHook(reward)
-        if rewards.takes_margins and not margins:
-            raise ParameterError("", "margins", margins, "True for a reward with a parameter margins")
         shared: dict[str, Any] = {"rewards": rewards, "most": max_episode_steps}
         self._fleet: Fleet
         if self.obstacle is None:
@@ -138,6 +135,15 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self._ended = np.zeros(self.num_envs, bool)
         self._of_episodes: dict[str, Any] = {}  # in `info`, until the next reset
         self._log = _ActionLog(self.num_envs)
+
+    def _obstacle_to_batch(self, *, margins: bool) -> str | None:
+        """Return what keeps the core from flying the environments at once, or None."""
+        obstacle = obstacle_to_batch(self.scenario)
+        if obstacle is None and margins:
+            compiled = Margins(self._single.limits, self.scenario.plant.timestep).compiled
+            if not compiled:
+                return "a constraint whose margins Python computes"
+        return obstacle
 
     @property
     def np_random(self) -> tuple[np.random.Generator | None, ...]:
@@ -191,12 +197,12 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             over = np.flatnonzero(self._ended).tolist()
             raise ResetNeeded(f"the episodes of {over} have ended: reset them with options={{'reset_mask': ...}}")
         numbers = check_action(actions, self.action_space)
-        again = self._ended.copy()  # none but with NEXT_STEP
+        to_reset = self._ended.copy()  # none, unless the mode is NEXT_STEP
         frame = self._next_frame()
         self._log.append(numbers)
-        self._fleet.step(numbers, ~again, frame)
-        if again.any():
-            self._start(self._next_episodes(again), frame)
+        self._fleet.step(numbers, ~to_reset, frame)
+        if to_reset.any():
+            self._start(self._next_episodes(to_reset), frame)
         self._frame = frame
         ended = frame.terminated | frame.truncated
         self._log.end(ended)
@@ -243,7 +249,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             raise ClosedEnvironmentError("the environments are closed; make new ones")
 
     def _next_frame(self) -> StepResults:
-        """Return a frame of its own, as users keep the last one's arrays; rows of places that rest stay."""
+        """Return new arrays for the results of a step, as users keep the last ones; observations start as they were."""
         last = self._frame
         frame = StepResults.empty(self.num_envs, last.observations.shape[1], last.smallest.shape[1])
         frame.observations[:] = last.observations

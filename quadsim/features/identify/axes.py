@@ -36,8 +36,8 @@ MOVE_COST: Final = 0.3
 READING_COST: Final = 0.7
 COSTLY_SHIFT: Final = 0.3  # [s] of shift between the clocks that counts as much as a correlation of 1
 LIFT_LAGS: Final = (0.0, 0.05, 0.1)  # [s] of the rotors behind their inputs, of which the best counts
-FALLING: Final = -0.4  # likeness of thrust and climb below which more thrust makes the vehicle fall
-_LEAST_EXPLAINED: Final = 0.3  # share of the lateral acceleration that tilt must explain to tell its direction
+FALLING: Final = -0.4  # concordance of thrust and climb below which more thrust makes the vehicle fall
+_LEAST_EXPLAINED: Final = 0.3  # share of the lateral acceleration that tilt must explain for its direction to count
 MIRRORED_BETTER: Final = 0.2  # by which the mirrored tilt must explain more
 OTHER_FRAME: Final = 30.0  # [deg] between the headings of tilt and velocity that is another frame
 OPPOSITE_FRAME: Final = 135.0  # [deg] from which z may point down too
@@ -181,8 +181,8 @@ def check_tilt(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None
     Raises:
         InputError: naming the frame or the columns that are negated or swapped.
     """
-    likeness = max(_lift_likeness(record, parts, vehicle.gravity, lag) for lag in LIFT_LAGS)
-    fault = _tilt_fault(lateral_motion(record, parts), falls=likeness < FALLING)
+    concordance = max(_lift_concordance(record, parts, vehicle.gravity, lag) for lag in LIFT_LAGS)
+    fault = _tilt_fault(lateral_motion(record, parts), falls=concordance < FALLING)
     if fault:
         raise InputError(f"{record.name}: {fault}; give world z up, body x forward, y left, z up")
 
@@ -211,8 +211,11 @@ def _tilt_fault(motion: Lateral, *, falls: bool) -> str:
     return ""
 
 
-def _lift_likeness(record: Record, parts: Sequence[slice], gravity: float, lag: float) -> float:
-    """How like the upward acceleration is to that of the upward thrust `lag` [s] earlier: 1 the same, -1 opposite."""
+def _lift_concordance(record: Record, parts: Sequence[slice], gravity: float, lag: float) -> float:
+    """Concordance of the upward acceleration with that of the upward thrust `lag` [s] earlier: 1 equal, -1 opposite.
+
+    It is 2 cov / (var + var) of the two.
+    """
 
     def lift(part: slice) -> Array:
         thrust = np.square(rotor_inputs(record)[part]).sum(axis=1, keepdims=True)

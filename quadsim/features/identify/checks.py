@@ -1,8 +1,8 @@
 """What of a log can be used, and whether its columns are what they should be; before any fit.
 
 `airborne_spans` finds the parts in the air: on the ground, the rotors carry less than the weight while the vehicle
-rests.  `check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one trusts what
-an earlier one saw.
+rests.  `check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one relies on
+what an earlier one has checked.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CONSTANT: Final = 3e-3  # share of the outputs below which their change in a sec
 UNCHANGED: Final = 1e-3  # share of the largest output below which a rotor's outputs never change
 MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
-LOAD_WINDOW: Final = 0.2  # [s] of an acceleration that tells what the rotors carry
+LOAD_WINDOW: Final = 0.2  # [s] of an acceleration that shows what the rotors carry
 REFUSED_HOVER_RATIO: Final = 1.8  # of the hover speeds in the log and by the start, either way
 NOTED_HOVER_RATIO: Final = 1.4
 LIKELY_UNITS: Final = (
@@ -172,7 +172,7 @@ def _advised(record: Record) -> str:
 
 
 def _logged(record: Record) -> NDArray[np.bool_]:
-    """Rows (N,) in no gap."""
+    """Rows (N,) without a gap in any field."""
     logged = np.ones(len(record.t), bool)
     for name in ("velocity", "attitude", "rates", "position", *ROTOR_INPUTS):
         rows = getattr(record, name)
@@ -184,7 +184,7 @@ def _logged(record: Record) -> NDArray[np.bool_]:
 def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDArray[np.bool_]:
     """Rows (N,) on the ground or near it; gaps are bridged by a straight line.
 
-    A log that rests under constant outputs, but for a second, never flies.
+    A log with less than a second of motion or of changing outputs has no flight: all its rows at rest are returned.
     """
     velocity = _bridged(record.velocity, logged)
     attitude = _bridged(record.attitude, logged)
@@ -203,7 +203,7 @@ def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDAr
     supported = np.abs(acceleration[:, 2]) < SUPPORTED * lacking * gravity
     resting = calm & (lacking > LEAST_LACKING) & supported
     eighth = second // 8
-    lasting = minimum_filter1d(resting.astype(np.int8), 2 * eighth + 1)  # not the top of a climb
+    lasting = minimum_filter1d(resting.astype(np.int8), 2 * eighth + 1)  # the top of a climb does not last
     margin = round(GROUND_MARGIN * second)
     return np.asarray(maximum_filter1d(lasting, 2 * (margin + eighth) + 1) > 0)
 
@@ -308,7 +308,7 @@ def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
 
 
 class RowCheck(NamedTuple):
-    """What has to hold of a log's complete rows before it is asked when it flies."""
+    """What has to hold of a log's complete rows; it is checked before the parts in the air are sought."""
 
     holds: str
     run: Callable[[Record, NDArray[np.bool_]], None]  # raises InputError where it does not
@@ -334,7 +334,7 @@ LOG_CHECKS: Final = (
     LogCheck("the velocity is the slope of the position", ("position",), check_velocity_axes),
     LogCheck("the velocity changes as tilt and thrust make it", (), check_tilt),
     LogCheck("gyro, attitude, velocity, position and gravity agree in scale", (), check_scales),
-    LogCheck("rates, attitude and velocity tell one time", (), check_clocks),
+    LogCheck("rates, attitude and velocity share one clock", (), check_clocks),
     LogCheck("speeds that carry the weight are about the start's", (), _check_units),
     LogCheck("each rotor turns as the others do at its command", ("speeds",), check_against_commands),
     LogCheck("no rotor's speed alone unbalances the torques", ("speeds",), check_against_each_other),
@@ -344,7 +344,7 @@ LOG_CHECKS: Final = (
     LogCheck("samples are frequent", (), _note_slow_logs),
     LogCheck("the rotors are within their limits", (), _note_limits),
 )
-"""Every check of a log that flies, in the order in which they are made: a later one trusts what an earlier one saw."""
+"""Every check of a log that flies, in the order in which they are made: a later one relies on the earlier ones."""
 
 
 def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:

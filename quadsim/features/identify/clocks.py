@@ -1,4 +1,4 @@
-"""Clocks of a log: attitude, rates and velocity of one motion must tell one time.
+"""Clocks of a log: attitude, rates and velocity of one motion must share one.
 
 The shift of the rates is where their correlation with the turning attitude peaks; that of the velocity, where tilt and
 thrust explain its change best.  One of the checks before any fit: a shift would be taken for drag and rotor inertia.

@@ -6,6 +6,7 @@ errors (`quadsim.features.identify.search`), and compares predictions on logs th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,31 +62,18 @@ def identify(
     """
     from quadsim.assets import vehicle_path
     from quadsim.features.identify.quantities import read_map
-    from quadsim.features.identify.report import NEEDED_PARAMETERS, identify_logs
-    from quadsim.features.identify.ulog import stated_rotors
+    from quadsim.features.identify.report import identify_logs
 
     if not logs:
         raise InputError("identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory")
     if vehicle is None:
-        rotors = ""
-        for log in logs:
-            rotors = rotors or stated_rotors(Path(log))
-        advice = (
-            "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
-            f" writes one; give your {NEEDED_PARAMETERS}, and estimates of the rest"
-        )
-        if rotors:
-            advice += f". The log has the rotors, in place of arm_length and rotor_azimuths: {rotors}"
-        raise InputError(advice)
+        raise InputError(_start_file_advice(logs))
     for option, path, suffix in (("--out", out, ".toml"), ("--page", page, ".html")):
         if path is not None and Path(path).suffix != suffix:
             raise ParameterError("", option, str(path), f"a file ending in {suffix}")
     fitted = [Path(log) for log in logs]
     tested = [Path(log) for log in test]
-    resolved = {log.resolve() for log in fitted}
-    for log in tested:
-        if log.resolve() in resolved:
-            raise ParameterError("", "--test", str(log), "a log that is not fitted too")
+    _require_unfitted(tested, fitted)
     return identify_logs(
         fitted,
         vehicle_path(str(vehicle)),
@@ -98,3 +86,27 @@ def identify(
         wind=wind,
         anyway=anyway,
     )
+
+
+def _start_file_advice(logs: Sequence[File]) -> str:
+    """How to make the start file that is missing; the rotors that a log states are part of it."""
+    from quadsim.features.identify.report import NEEDED_PARAMETERS
+    from quadsim.features.identify.ulog import stated_rotors
+
+    advice = (
+        "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
+        f" writes one; give your {NEEDED_PARAMETERS}, and estimates of the rest"
+    )
+    for log in logs:
+        rotors = stated_rotors(Path(log))
+        if rotors:
+            return f"{advice}. The log has the rotors, in place of arm_length and rotor_azimuths: {rotors}"
+    return advice
+
+
+def _require_unfitted(tested: Sequence[Path], fitted: Sequence[Path]) -> None:
+    """Refuse a log that is both fitted and tested."""
+    resolved = {log.resolve() for log in fitted}
+    for log in tested:
+        if log.resolve() in resolved:
+            raise ParameterError("", "--test", str(log), "a log that is not fitted too")

@@ -21,7 +21,7 @@ from quadsim.features.identify.noise import NoiseFit, identify_noise
 from quadsim.features.identify.search import Search
 from quadsim.state import Array
 
-WIDEST_NOISE: Final = 1.4  # half-width of an interval, in logarithms, above which it tells nothing: a factor of 4
+WIDEST_NOISE: Final = 1.4  # half-width of an interval, in logarithms, above which it identifies nothing: a factor of 4
 LEAST_GAIN: Final = 5.0  # in the logarithm of the likelihood, from which noise is not that of the sensor alone
 _NORMAL_BLOCKS: Final = 10**6  # of which Student's distribution is normal
 _UNKNOWN: Final = 50.0  # half-width in logarithms from which nothing is known
@@ -88,7 +88,7 @@ def _half_widths(fit: NoiseFit) -> Array:
 
 
 def _fault(fit: NoiseFit, halves: Array, shortest: float) -> str:
-    """Why a log does not tell the noise of an axis, or nothing."""
+    """Why a log does not identify the noise of an axis, or an empty text."""
     if fit.noise.time < shortest:
         return "it changes from sample to sample"
     if halves.max() > WIDEST_NOISE:

@@ -64,7 +64,7 @@ class DisturbanceEstimate:
     unit: str
     deviation: float
     deviation_interval: tuple[float, float]  # 95 %
-    time: float  # constant, with which it is forgotten [s]
+    time: float  # constant with which it decays [s]
     time_interval: tuple[float, float]  # 95 % [s]
     refused: str = ""  # why it is not identified; empty where it is
 
@@ -91,7 +91,7 @@ class Identification:
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n [-]
     voltage: float | None = None  # V0, at which the thrust coefficient holds [V]; None without a battery in the log
-    noise: tuple[AxisNoise, ...] = ()  # what is not modelled, in the order of `INCREMENTS`; empty where not sought
+    noise: tuple[AxisNoise, ...] = ()  # what is not modelled, in the order of `INCREMENTS`; or empty
     disturbance: tuple[DisturbanceEstimate, ...] = ()  # the same as torques and forces
     rates_last: float = math.inf  # time constant with which body rates decay [s]
     whiteness: dict[str, float] = field(default_factory=dict)  # largest |autocorrelation| of innovations by axis [-]

@@ -1,4 +1,4 @@
-"""The fit of flight logs: every parameter with its interval, and the vehicle with those that a log tells.
+"""The fit of flight logs: every parameter with its interval, and the vehicle with those that are identified.
 
 Two searches follow one another.  The first finds every number and its interval; the second finds the numbers that pass
 their gates once more, the others held at what the vehicle file will say of them, so that the file is one fit.
@@ -33,7 +33,7 @@ def identify_records(
         records: logs of one vehicle.
         spans: of each, the parts that fly.
         vehicle: the start.
-        wind: whether wind is sought where the position is logged; it always is where only a velocity is.
+        wind: whether wind is searched for where the position is logged; it always is where only a velocity is.
 
     Raises:
         InputError: nothing flies, or the records differ in what they say of rotors and battery.
@@ -45,26 +45,26 @@ def identify_records(
     if records[0].speeds is not None and (records[0].commands is not None or records[0].throttle is not None):
         response, flown = _with_instruments(flown, vehicle)
 
-    def searched(fixed: Mapping[str, float], begin: Search | None = None) -> Search:
+    def run_search(fixed: Mapping[str, float], initial: Search | None = None) -> Search:
         search = Search(flown, vehicle, wind=wind, fixed=fixed)
-        if begin is not None:
-            search.adopt(begin)
+        if initial is not None:
+            search.adopt(initial)
         search.run()
         return search
 
-    search = searched({})
+    search = run_search({})
     judgement = JudgedFit(search, response)
-    undamped = _negative_damping(search)
-    while undamped:  # negative damping would stand for lag
-        search = searched({**search.fixed, **undamped}, search)
+    negative = _negative_damping(search)
+    while negative:  # it would absorb an error of the lag
+        search = run_search({**search.fixed, **negative}, search)
         judgement = JudgedFit(search, response, judgement)
-        undamped = _negative_damping(search)
+        negative = _negative_damping(search)
     held = judgement.held()
-    refined = searched(held, search)
+    refined = run_search(held, search)
     refused = _impossible(refined) | judgement.refuse_moved(refined)
     while refused:
         held |= refused
-        refined = searched(held, refined)
+        refined = run_search(held, refined)
         refused = _impossible(refined) | judgement.refuse_moved(refined)
     return with_disturbance(_result(judgement, refined), refined)
 
@@ -99,8 +99,8 @@ def _negative_damping(search: Search) -> dict[str, float]:
     """Sought numbers that would drive a motion instead of slowing it, each with the 0 to hold it at."""
     parameters = search.parameters(search.x, 0)
     values = dict(zip(DAMPING, (*parameters.rate_damping, parameters.inflow), strict=True))
-    sought = search.names
-    return {name: 0.0 for name, value in values.items() if value < 0.0 and name in sought}
+    searched = search.names
+    return {name: 0.0 for name, value in values.items() if value < 0.0 and name in searched}
 
 
 def _impossible(search: Search) -> dict[str, float]:
@@ -121,11 +121,11 @@ def _result(judgement: JudgedFit, refined: Search) -> Identification:
     flights = tuple(_flight_numbers(refined, flight) for flight in range(refined.flight_count))
     delays, offsets, winds = zip(*flights, strict=True)
 
-    def of_response(name: str, sought: float) -> float:
+    def of_response(name: str, searched: float) -> float:
         """What measured speeds show of the response to throttle and voltage, else what was searched for."""
         estimate = judgement.estimates.get(name)
         if not judgement.speeds_measured or estimate is None or estimate.refused:
-            return sought
+            return searched
         return estimate.value
 
     return Identification(

@@ -2,7 +2,7 @@
 
 Half a width is q_N w s_e, of noise, and q_t (s_b^2 + s_f^2 + s_m^2)^(1/2), of the scatter by leaving out blocks, of
 what flights differ by and of what the model leaves out, together; q_N and q_t are the quantiles of the normal and of
-Student's distribution.  `judgement` decides by these what a log tells.
+Student's distribution.  `judgement` decides by these what a log identifies.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CHANCE_AUTOCORRELATION: Final = 3.7
 """The same times sqrt(N) that noise of N samples stays below in 99 %, at 8 lags of 6 axes: more than 0.2 if N < 342."""
 _NORMAL_QUANTILE: Final = 1.96  # of `INTERVAL_SHARE`, in standard deviations
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
-_SHARED_INFORMATION: Final = 0.02  # of what all flights say together, that is added to what one says alone
+_SHARED_INFORMATION: Final = 0.02  # share of the information of all flights that is added to that of one alone
 
 
 class Intervals:

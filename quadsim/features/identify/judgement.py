@@ -1,4 +1,4 @@
-"""What a log tells of each parameter: its estimate with an interval, and the gates that refuse what it cannot tell.
+"""What a log shows of each parameter: its estimate with an interval, refused where it is not identifiable.
 
 A number is identified if half its interval is at most 25 %, or an absolute width where it may be 0; if at most a
 quarter of the information on it is prior; and if it makes a body.  `fit` has the first search judged, holds what is
@@ -23,10 +23,10 @@ from quadsim.vehicle import VEHICLE_UNITS
 WIDEST: Final = 0.25
 """Half-width of an interval, in logarithms, above which a log is said not to excite a parameter."""
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
-MOST_UNCARRIED: Final = 0.01  # share of the weight that thrust and drag may leave over, or carry too much
-_WIDEST_SAID: Final = 1.1  # half-width above which its size is not told
+MOST_WEIGHT_RESIDUAL: Final = 0.01  # share of the weight that thrust and drag may leave over, or carry too much
+_WIDEST_STATED: Final = 1.1  # half-width above which a message states no number
 _REPEATABLE: Final = 2.0  # times `WIDEST` that an interval may be for more of the same flight to help
-_LEAST_KNOWN: Final = 0.5  # deviation of a logarithm below which a log tells a number that the start lacks
+_LARGEST_NEW_DEVIATION: Final = 0.5  # of the logarithm of a number that the start lacks, for it to count as identified
 
 # What the prediction leaves out: standard deviations in units of the search.
 _MODEL_ERROR: Final = 0.0015  # of a number without one of its own below
@@ -52,7 +52,7 @@ _LOG_SPEEDS: Final = "log the rotors' speeds too"
 
 
 class _Gate(NamedTuple):
-    """How a parameter is judged and learnt."""
+    """When a parameter counts as identified, and what to fly where it does not."""
 
     axes: tuple[str, ...]  # whose innovations show it
     advice: str  # what to fly to learn it
@@ -123,7 +123,7 @@ class JudgedFit:
         self._gusts_turn = self._wind_makes_torque()
         self._rotors_unknown = max(segment.record.rotors_unknown for segment in search.segments)
         self.refitted: set[str] = set()
-        """Numbers that are refused and yet sought once more: where the log speaks against the start."""
+        """Numbers that are refused and yet estimated once more: where the log contradicts the start."""
         self.estimates = self._all_estimates(response)
         if before is not None:
             self.refitted |= before.refitted & {*search.fixed}
@@ -270,7 +270,7 @@ class JudgedFit:
         half = float(halves.min())
         if len(places) > 1:
             half = max(half, float(np.abs(x - middle).max()))
-        elif self._speaks_against_the_start(places[0]):
+        elif self._contradicts_start(places[0]):
             self.refitted.add(name)
         value = parameter.value(middle)
         ends = (parameter.value(middle - half), parameter.value(middle + half))
@@ -280,14 +280,14 @@ class JudgedFit:
         needed = self.search.seconds * (half / WIDEST) ** 2
         return replace(estimate, advice=f"{estimate.advice}, or the same again, {needed:.0f} s in all")
 
-    def _speaks_against_the_start(self, place: int) -> bool:
-        """Whether a number is two standard deviations of what the innovations explain from the start's, or from 0."""
+    def _contradicts_start(self, place: int) -> bool:
+        """Whether a number is two standard deviations, by the innovations' noise, away from the start's or from 0."""
         parameter = self.search.free[place]
         if parameter.name == "body_drag" or parameter.name in _PER_FLIGHT:
             return False
         deviation = math.sqrt(self.intervals.covariance[place, place])
         if parameter.scale is None and number_in(self.vehicle, parameter.name) is None:
-            return deviation < _LEAST_KNOWN
+            return deviation < _LARGEST_NEW_DEVIATION
         return abs(self.search.x[place]) > 2.0 * deviation
 
     def _fault(self, name: str, places: Sequence[int], half: float, value: float) -> str:
@@ -295,9 +295,9 @@ class JudgedFit:
         if name.startswith("inertia_") and not self.search.settled:
             return f"{_NOT_EXCITED}: the commands explain too little of the measured speeds"
         if name == "thrust_coefficient":
-            uncarried = self._uncarried()
-            if abs(uncarried) > MOST_UNCARRIED:
-                return f"with it, {uncarried:.1%} of the weight is not carried, allowed {MOST_UNCARRIED:.0%}"
+            residual = self._weight_residual()
+            if abs(residual) > MOST_WEIGHT_RESIDUAL:
+                return f"with it, {residual:.1%} of the weight is not carried, allowed {MOST_WEIGHT_RESIDUAL:.0%}"
         too_wide = _too_wide(name, self.search.free[places[0]].scale, half, value)
         if too_wide:
             return too_wide
@@ -311,8 +311,8 @@ class JudgedFit:
             return f"rests on a rule of thumb for {prior_share:.0%}, allowed {MOST_PRIOR:.0%}"
         return ""
 
-    def _uncarried(self) -> float:
-        """Share of the weight that neither thrust nor drag carry, in the mean over all segments."""
+    def _weight_residual(self) -> float:
+        """Share of the weight that thrust and drag leave unbalanced, in the mean over all segments."""
         search = self.search
         lift_misfits = []
         for i in range(len(search.segments)):
@@ -351,7 +351,7 @@ class JudgedFit:
         )
 
     def _judged_together(self, estimates: dict[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
-        """Refuse what cannot be told without a number that is refused."""
+        """Refuse the numbers that are not identifiable without one that is refused."""
 
         def refuse(name: str, fault: str, advice: str) -> None:
             estimates[name] = replace(estimates[name], refused=fault, advice=advice)
@@ -377,13 +377,13 @@ class JudgedFit:
         if not estimates["inertia_z"].refused and not is_body(inertia):
             fault = f"no body has it beside {inertia[0]:.4g} and {inertia[1]:.4g} about x and y"
             refuse("inertia_z", fault, _TURNS)
-        if estimates["inertia_z"].refused and self._knows_yaw_acceleration():
+        if estimates["inertia_z"].refused and self._identifies_yaw_acceleration():
             fault = "only the yaw acceleration that it gives is identified, with inertia_z as kept"
             refuse("drag_to_thrust", fault, _TURNS)
             self.refitted.add("drag_to_thrust")
         return _in_order(estimates)
 
-    def _knows_yaw_acceleration(self) -> bool:
+    def _identifies_yaw_acceleration(self) -> bool:
         """Whether d b / J_z, drag to thrust times thrust over inertia, is known where none of them may be."""
         exponents = {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
         shares = {}
@@ -440,9 +440,9 @@ def _too_wide(name: str, scale: float | None, half: float, value: float) -> str:
     if scale is not None:
         relative = half * scale / abs(value)
     if relative > WIDEST:
-        if relative < _WIDEST_SAID:
+        if relative < _WIDEST_STATED:
             width = f"+-{np.expm1(relative):.0%}"
         else:  # it may be too large for an exponential
-            width = f"more than +-{np.expm1(_WIDEST_SAID):.0%}"
+            width = f"more than +-{np.expm1(_WIDEST_STATED):.0%}"
         return f"{_NOT_EXCITED}: the interval is {width}, allowed {np.expm1(WIDEST):.0%}"
     return ""

@@ -2,7 +2,7 @@
 
     d_k = integral of a(t) over the period + n_k+1 - n_k
 
-a: an acceleration of deviation s, forgotten with a time constant T (Ornstein-Uhlenbeck); n: the sensor's white noise of
+a: an acceleration of deviation s, decaying with a time constant T (Ornstein-Uhlenbeck); n: the sensor's white noise of
 deviation r.  `disturbance` gives s and T as a torque or a force, `prediction` starts from the forecasts.
 """
 
@@ -31,7 +31,7 @@ _SLOPE_STEP: Final = 1e-3  # for slopes of innovations by differences, in logari
 _FARTHEST: Final = 50.0  # largest logarithm of a deviation that the search tries, either way
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
 _REGULAR: Final = 1e-6 * np.eye(3)  # information without which a number that nothing shows has none
-_MEMORY: Final = 2000  # samples after which a segment has forgotten the error of its first
+_MEMORY: Final = 2000  # samples after which the error of a segment's first one has decayed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +40,8 @@ class AxisNoise:
 
     With q = exp(-h / T), h the period, (1 - q / z) d_k is a moving average of second order, so that d has the
     innovations e = (1 - q / z) / C(z) d of a stationary Kalman filter; C follows from the autocovariances in closed
-    form.  Forecasts of d are those of that filter: a acts on, fading with T, and the error of the last sample is taken
-    back (Box, Jenkins, Reinsel and Ljung, "Time Series Analysis", 5th ed., Secs. 5.1 and 5.2).
+    form.  Forecasts of d are those of that filter: a acts on, decaying with T, and the error of the last sample is
+    taken back (Box, Jenkins, Reinsel and Ljung, "Time Series Analysis", 5th ed., Secs. 5.1 and 5.2).
     """
 
     deviation: float = 0.0  # s [rad/s^2, m/s^2]
@@ -50,25 +50,25 @@ class AxisNoise:
 
     def _innovations_form(self, period: float) -> tuple[Array, Array, float]:
         """1 - q / z, C(z) and the innovations' variance."""
-        kept = math.exp(-period / self.time)
+        decay = math.exp(-period / self.time)
         scale = (self.deviation * self.time) ** 2
         # autocovariances of the acceleration's increments, at lag 0 and 1
-        lag_0 = 2.0 * scale * (period / self.time - 1.0 + kept)
-        lag_1 = scale * (1.0 - kept) ** 2
+        lag_0 = 2.0 * scale * (period / self.time - 1.0 + decay)
+        lag_1 = scale * (1.0 - decay) ** 2
         noise = self.sensor**2
-        zeroth = (1.0 + kept**2) * lag_0 - 2.0 * kept * lag_1 + noise * (1.0 + (1.0 + kept) ** 2 + kept**2)
-        first = lag_1 - kept * lag_0 - noise * (1.0 + kept) ** 2
-        second = noise * kept
+        zeroth = (1.0 + decay**2) * lag_0 - 2.0 * decay * lag_1 + noise * (1.0 + (1.0 + decay) ** 2 + decay**2)
+        first = lag_1 - decay * lag_0 - noise * (1.0 + decay) ** 2
+        second = noise * decay
         moving_average = _factor(zeroth, first, second)
         variance = zeroth / float(moving_average @ moving_average)
-        return np.array([1.0, -kept]), moving_average, variance
+        return np.array([1.0, -decay]), moving_average, variance
 
     def innovations(self, misfit: Array, period: float) -> tuple[Array, float]:
         """(N,) innovations of a misfit (N,), less the error of its first sample, and their variance."""
-        fading, moving_average, variance = self._innovations_form(period)
-        innovations = lfilter(fading, moving_average, misfit)
+        autoregressive, moving_average, variance = self._innovations_form(period)
+        innovations = lfilter(autoregressive, moving_average, misfit)
         impulse = np.eye(1, min(len(misfit), _MEMORY))[0]
-        of_first_error = lfilter(fading, moving_average, impulse)
+        of_first_error = lfilter(autoregressive, moving_average, impulse)
         head = innovations[: len(of_first_error)]
         head -= float(of_first_error @ head) / float(of_first_error @ of_first_error) * of_first_error
         return innovations, variance
@@ -77,23 +77,23 @@ class AxisNoise:
         """(W, length) expected misfits from W starts on, each by the misfits (N,) of the periods before it alone."""
         if not self.deviation and not self.sensor:
             return np.zeros((len(starts), length))
-        fading, moving_average, _ = self._innovations_form(period)
-        kept = -fading[1]
-        innovations = np.concatenate([[0.0, 0.0], lfilter(fading, moving_average, misfit)])
+        autoregressive, moving_average, _ = self._innovations_form(period)
+        decay = -autoregressive[1]
+        innovations = np.concatenate([[0.0, 0.0], lfilter(autoregressive, moving_average, misfit)])
         last_misfit = np.concatenate([[0.0], misfit])[starts]
         last = innovations[starts + 1]
         last_but_one = innovations[starts]
-        first = kept * last_misfit + moving_average[1] * last + moving_average[2] * last_but_one
-        second = kept * first + moving_average[2] * last
-        later = second[:, None] * kept ** np.arange(length - 1)
+        first = decay * last_misfit + moving_average[1] * last + moving_average[2] * last_but_one
+        second = decay * first + moving_average[2] * last
+        later = second[:, None] * decay ** np.arange(length - 1)
         return np.concatenate([first[:, None], later], axis=1)
 
-    def surprises(self, white: Array, period: float) -> Array:
-        """(W, length) what comes on top of forecasts, from standard normal numbers (W, length)."""
+    def forecast_errors(self, white: Array, period: float) -> Array:
+        """(W, length) random errors of forecasts, from standard normal numbers (W, length)."""
         if not self.deviation and not self.sensor:
             return np.zeros(white.shape)
-        fading, moving_average, variance = self._innovations_form(period)
-        return np.asarray(math.sqrt(variance) * lfilter(moving_average, fading, white, axis=1))
+        autoregressive, moving_average, variance = self._innovations_form(period)
+        return np.asarray(math.sqrt(variance) * lfilter(moving_average, autoregressive, white, axis=1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
         beyond = float(np.abs(x - np.clip(x, least, most)).sum())
         return beyond + _cost(noise_of(x), misfits, periods)
 
-    x = _rough_minimum(cost, misfits, periods)
+    x = _coarse_minimum(cost, misfits, periods)
     reached = _cost(noise_of(x), misfits, periods)
     for _ in range(_MAX_SCORING_STEPS):
         information, gradients = _information(x, noise_of, misfits, periods, blocks)
@@ -146,7 +146,7 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
     )
 
 
-def _rough_minimum(
+def _coarse_minimum(
     cost: Callable[[Array, Sequence[Array]], float], misfits: Sequence[Array], periods: Sequence[float]
 ) -> Array:
     """Logarithms of deviation, time constant and sensor's deviation at the least cost of the first samples."""

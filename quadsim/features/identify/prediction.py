@@ -1,8 +1,9 @@
-"""Open-loop prediction on flight that was not fitted: what the identified numbers are worth.
+"""Open-loop prediction on flight that was not fitted: the validation of the identified numbers.
 
 From every window's start, the measured state is simulated with the rotor speeds that the log gives, and compared with
-what was measured up to 0.5 s later: x_{k+1} = x_k + T f(x_k + T/2 f(x_k)).  The identified vehicle stands beside the
-start file, two models of thrust and drag alone, and the floor that the identified disturbance leaves to any of them.
+what was measured up to 0.5 s later: x_{k+1} = x_k + T f(x_k + T/2 f(x_k)).  The identified vehicle is compared with
+the start file, with two models of thrust and drag alone, and with the error that the identified disturbance causes to
+any model, the floor.
 """
 
 from __future__ import annotations
@@ -38,12 +39,14 @@ HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at 
 RESIDUAL_AFTER: Final = 0.25  # [s] from a window's start
 JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
 RATES_JUDGED: Final = 2  # of them for body rates: later, what is not known of the torque is most of the error
-TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
+TIE: Final = (
+    0.05  # by which the errors of a quantity may exceed a baseline's, in their geometric mean over the horizons
+)
 NEAR_FLOOR: Final = 0.25  # by which they may exceed the floor to be said to reach it
 
 IDENTIFIED = "identified"
-"""Starts with the torque and force that a filter knows at that instant, of the periods before it alone, and which fade
-as the identified noise does (`AxisNoise`)."""
+"""Starts with the torque and force that a filter estimates from the periods before, which decay as the identified noise
+does (`AxisNoise`)."""
 NO_DISTURBANCE = "undisturbed"
 """The same without them."""
 START = "start"
@@ -53,10 +56,10 @@ RATES_HELD = "rates held"
 RATES_DECAY = "rates decay"
 """The same, but rates decay as they did in what was fitted."""
 NOISE_FLOOR = "floor"
-"""What the identified noise leaves open to any prediction that knows the vehicle: the error of the simulation against
+"""The error that the identified noise causes even where the vehicle is known exactly: that of the simulation against
 itself with noise that comes after the start.  In a closed loop, it may exceed the errors of rates that are held: the
-rotors' coming speeds answer a torque that the model does not know, and the vehicle turns less than they say."""
-RIVALS: Final = (START, RATES_HELD, RATES_DECAY)
+rotors' later speeds counteract a torque that the model does not have, and the vehicle turns less than they predict."""
+BASELINES: Final = (START, RATES_HELD, RATES_DECAY)
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
@@ -93,10 +96,10 @@ class PredictionErrors:
     residuals: Mapping[str, Array]
     """By model: (W, 6) measured less predicted velocity, world [m/s], and body rates [rad/s] after `RESIDUAL_AFTER`."""
 
-    def ratios(self, rival: str) -> dict[str, tuple[float, ...]]:
-        """Errors of the identified vehicle over a rival's at those of `JUDGED` that count, by quantity in the logs."""
+    def ratios(self, baseline: str) -> dict[str, tuple[float, ...]]:
+        """By logged quantity: errors of the identified vehicle over a baseline's, at those of `JUDGED` that count."""
         at = [HORIZONS.index(horizon) for horizon in JUDGED]
-        ratios = self.errors[IDENTIFIED][at] / np.maximum(self.errors[rival][at], 1e-12)
+        ratios = self.errors[IDENTIFIED][at] / np.maximum(self.errors[baseline][at], 1e-12)
         by_quantity = {}
         for quantity, of_quantity in zip(QUANTITIES, ratios.T.tolist(), strict=True):
             counted = len(JUDGED)
@@ -106,22 +109,22 @@ class PredictionErrors:
                 by_quantity[quantity] = tuple(of_quantity[:counted])
         return by_quantity
 
-    def _exceeding(self, rival: str, share: float) -> dict[str, tuple[float, ...]]:
+    def _exceeding(self, baseline: str, share: float) -> dict[str, tuple[float, ...]]:
         """The ratios of those quantities whose geometric mean over the horizons exceeds 1 by a share."""
         exceeding = {}
-        for quantity, ratios in self.ratios(rival).items():
+        for quantity, ratios in self.ratios(baseline).items():
             if math.prod(ratios) > (1.0 + share) ** len(ratios):
                 exceeding[quantity] = ratios
         return exceeding
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Where a rival predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
+        """Where a baseline predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
         lost = []
-        for rival in RIVALS:
-            for quantity, ratios in self._exceeding(rival, TIE).items():
+        for baseline in BASELINES:
+            for quantity, ratios in self._exceeding(baseline, TIE).items():
                 listed = " ".join(f"{ratio:.2f}" for ratio in ratios)
-                lost.append(f"{quantity} than {rival}, {listed} times its error")
+                lost.append(f"{quantity} than {baseline}, {listed} times its error")
         return tuple(lost)
 
     @property
@@ -133,16 +136,16 @@ class PredictionErrors:
 
     @property
     def verdict(self) -> str:
-        """Whether the identified vehicle predicts better than its rivals, and by how much."""
+        """Whether the identified vehicle predicts better than its baselines, and by how much."""
         horizons = f"at {', '.join(f'{horizon:g}' for horizon in JUDGED)} s"
         if self.lost:
             return f"predicts flight that was not fitted worse, {horizons}: {'; '.join(self.lost)}"
-        *others, last = (f"{self._mean_ratios(rival)} of the errors of {rival}" for rival in RIVALS)
+        *others, last = (f"{self._mean_ratios(baseline)} of the errors of {baseline}" for baseline in BASELINES)
         return f"predicts flight that was not fitted better: {horizons}, {', '.join(others)} and {last}"
 
-    def _mean_ratios(self, rival: str) -> str:
-        """The geometric mean over the quantities of the ratios to a rival, at each horizon of the verdict."""
-        by_quantity = self.ratios(rival).values()
+    def _mean_ratios(self, baseline: str) -> str:
+        """The geometric mean over the quantities of the ratios to a baseline, at each horizon of the verdict."""
+        by_quantity = self.ratios(baseline).values()
         means = []
         for i in range(len(JUDGED)):
             at_horizon = [ratios[i] for ratios in by_quantity if i < len(ratios)]
@@ -209,18 +212,23 @@ def predict(
             f"what is held out for the prediction is shorter than one window of {PREDICTION_WINDOW:g} s: fly longer, "
             "or give another log with --test"
         )
+    return _errors_of_all(spans_predicted)
+
+
+def _errors_of_all(spans: Sequence[_SpanPrediction]) -> PredictionErrors:
+    """The errors of the windows of all spans; the trace is that of the span with most windows."""
     errors = {}
-    for model in spans_predicted[0].errors:
-        errors[model] = np.concatenate([span.errors[model] for span in spans_predicted])
+    for model in spans[0].errors:
+        errors[model] = np.concatenate([span.errors[model] for span in spans])
     residuals = {}
-    for model in spans_predicted[0].residuals:
-        residuals[model] = np.concatenate([span.residuals[model] for span in spans_predicted])
-    longest = max(spans_predicted, key=lambda span: len(span.trace.t))
+    for model in spans[0].residuals:
+        residuals[model] = np.concatenate([span.residuals[model] for span in spans])
+    longest = max(spans, key=lambda span: len(span.trace.t))
     return PredictionErrors(
         windows=len(errors[IDENTIFIED]),
         errors={model: of_windows.mean(axis=0) for model, of_windows in errors.items()},
         trace=longest.trace,
-        ends=_one_after_the_other([span.t for span in spans_predicted]),
+        ends=_one_after_the_other([span.t for span in spans]),
         residuals=residuals,
     )
 
@@ -293,10 +301,11 @@ def _predictions(
         RATES_DECAY: windows.simulated(identified, rotors, decay_time=known.rates_last),
     }
     predicted = {model: _Predicted(of_model, measured) for model, of_model in states.items()}
+    # The floor: the same windows with random errors of the forecast, in place of what was measured.
     again = windows.repeated(_FLOOR_DRAWS)
-    surprises = _surprises(known, record.period, (len(again.rows), steps), rng)
+    random_errors = _forecast_errors(known, record.period, (len(again.rows), steps), rng)
     expected = np.tile(disturbance, (_FLOOR_DRAWS, 1, 1))
-    disturbed = again.simulated(identified, rotors, expected + surprises)
+    disturbed = again.simulated(identified, rotors, expected + random_errors)
     undisturbed = np.tile(states[IDENTIFIED], (_FLOOR_DRAWS, 1, 1))
     predicted[NOISE_FLOOR] = _Predicted(undisturbed, disturbed)
     return predicted
@@ -346,14 +355,14 @@ def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: RotorMotion, 
     return misfit
 
 
-def _surprises(known: Identification, period: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
-    """(*shape, 6) increments on top of those that are expected, drawn from the identified noise."""
+def _forecast_errors(known: Identification, period: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+    """(*shape, 6) random errors of the forecast increments, drawn from the identified noise."""
     if not known.noise:
         return np.zeros((*shape, len(INCREMENTS)))
     drawn = []
     for noise in known.noise:
         white = rng.standard_normal(shape)
-        drawn.append(noise.surprises(white, period))
+        drawn.append(noise.forecast_errors(white, period))
     return np.stack(drawn, axis=-1)
 
 

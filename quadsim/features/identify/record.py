@@ -37,7 +37,7 @@ LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longe
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
 SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 FASTEST_RATE: Final = 250.0  # [Hz] above which samples are averaged: none of the parameters is as fast
-SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
+SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer gives it better
 LONGEST_PAUSE: Final = 600.0  # [s] between two samples of one flight
 MOST_TIMES_REPEATED: Final = 0.5  # share of rows whose repeated time is that of a row to drop, not of a coarse clock
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
@@ -53,9 +53,9 @@ class LogFormat(NamedTuple):
 
     title: str
     suffixes: tuple[str, ...]
-    first_bytes: tuple[bytes, ...]  # which also tell it
+    first_bytes: tuple[bytes, ...]  # of a file of this kind, whatever its suffix
     read: Callable[[Path, Sequence[NamedQuantity]], LoggedColumns]
-    library: str = ""  # that `read` imports, of the extra `logs`
+    library: str = ""  # that `read` imports; it is installed with the extra `logs`
 
 
 _BAG: Final = LogFormat(
@@ -90,9 +90,9 @@ class Record:
     voltage: Array | None = None  # (N,) of the battery [V]
     flying: NDArray[np.bool_] | None = None  # (N,) whether its autopilot was armed and not landed
     fresh: NDArray[np.bool_] | None = None  # (N,) rows that a radio did not hold, where it held any
-    rotors_unknown: float = 0.0  # share of rows in which the radio held what it says of the rotors too
+    rotors_unknown: float = 0.0  # share of rows in which the radio held the columns of the rotors too
     inertial: bool = False
-    """Whether an accelerometer stands in for the velocity, which then has its changes, but neither mean nor drift."""
+    """Whether the velocity is the integral of an accelerometer: its changes are known, its mean and drift are not."""
     notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
     advice: str = ""  # how its autopilot logs more
 
@@ -141,22 +141,15 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         columns: a map of its columns (`quadsim.features.identify.quantities.read_map`).
 
     Raises:
-        FileError: it is missing or damaged, or lacks a column; the message names what is allowed. Whatever else its
-            values make reading raise is such an error.
+        FileError: it is missing or damaged, or lacks a column; the message names what is allowed. Any other error that
+            its values cause while it is read is raised as this one.
         MissingPackageError: its format needs a library that is not installed.
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
-    location = Path(path)
-    is_bag = (location / "metadata.yaml").is_file()  # of ROS 2, a directory
-    if location.is_dir() and not is_bag:
-        file = location / FLIGHT_FILE
-    else:
-        file = location
-    if not (file.is_file() or is_bag):
-        raise FileError(location, "has no flight.parquet" if location.is_dir() else "is missing, or not a file")
+    file = _file_of(Path(path))
     kind = _format_of(file)
     if kind.read is not read_columns and any(named.quantity == "t" for named in columns):
-        raise InputError(f"{location.name}: has a clock of its own; leave [t] out of the map")
+        raise InputError(f"{file.name}: has a clock of its own; leave [t] out of the map")
     name = file.name
     if name == FLIGHT_FILE:
         name = file.resolve().parent.name
@@ -167,7 +160,21 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
     return replace(record, advice=log.advice, notes=(*log.notes, *record.notes))
 
 
+def _file_of(location: Path) -> Path:
+    """The log at a location: the table of a run directory, or the location itself, a file or a bag of ROS 2."""
+    is_bag = (location / "metadata.yaml").is_file()  # of ROS 2, a directory
+    if is_bag or location.is_file():
+        return location
+    if not location.is_dir():
+        raise FileError(location, "is missing, or not a file")
+    table = location / FLIGHT_FILE
+    if not table.is_file():
+        raise FileError(location, "has no flight.parquet")
+    return table
+
+
 def _format_of(file: Path) -> LogFormat:
+    """The format of a log, by its first bytes, else by its suffix."""
     if file.is_dir():
         return _BAG
     try:
@@ -193,8 +200,8 @@ def _format_of(file: Path) -> LogFormat:
 def to_record(name: str, series: Mapping[str, Column]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
-    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
-    has no gaps: it changes slowly; nor has `flying`, which changes rarely.
+    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. Gaps of the
+    voltage, which changes slowly, and of `flying`, which changes rarely, are bridged.
     """
     logged = dict(series)
     flying = logged.pop("flying", None)
@@ -205,7 +212,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     kept = _without_empty(kept)
     inertial = not {"velocity", "position"} & {*kept}
     moving, derived = _with_motion(name, kept, force)
-    notes = [*notes, *derived]
+    notes += derived
     grid = _clock(name, moving)
     period = float(grid[1] - grid[0])
     values: dict[str, Any] = {}
@@ -216,25 +223,20 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     if inertial:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
     elif force is not None and velocity_period > SLOWEST_VELOCITY:
-        by_force = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
-        values["velocity"] = filled_velocity(values["velocity"], by_force, round(2.0 * velocity_period / period))
+        values["velocity"] = _filled_by_force(name, values, force, grid, velocity_period)
         rate = 1.0 / velocity_period
         notes.append(f"{name}: the velocity is logged at {rate:.3g} Hz; the accelerometer fills it in")
     if voltage is not None:
         there = np.isfinite(voltage.values[:, 0])
         if there.any():
             values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
-    if fresh is not None:
+    if fresh is not None:  # as numbers on the grid, which may be averaged below
         fresh_rows, known_rotors = latest_samples(fresh, grid + STAMP_JITTER * period).T
         values["fresh"] = fresh_rows
         values["rotors_unknown"] = np.full(len(grid), 1.0 - known_rotors.mean())
-    size = int(1.0 / (FASTEST_RATE * period))
-    if size > 2 and len(grid) > 10 * size:
-        grid, values = _thinned(grid, values, size - 1 + size % 2)
-        _normalise_rows(values["attitude"])
-        mean_rate = 1.0 / (grid[1] - grid[0])
-        notes.append(f"{name}: {1.0 / period:.0f} Hz, of which means at {mean_rate:.0f} Hz are used")
-    if "fresh" in values:
+    grid, values, averaged = _at_fastest_rate(name, grid, values)
+    notes += averaged
+    if "fresh" in values:  # a mean over rows of which any is new counts as new
         values["fresh"] = values["fresh"] > 0.0
         values["rotors_unknown"] = float(values["rotors_unknown"][0])
     if flying is not None:
@@ -242,12 +244,37 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     return Record(name=name, t=grid, notes=tuple(notes), inertial=inertial, **values)
 
 
+def _filled_by_force(
+    name: str, values: Mapping[str, Array], force: Column, grid: Array, velocity_period: float
+) -> Array:
+    """The velocity (N, 3) of a log that has it every `velocity_period` [s], filled in by the accelerometer."""
+    period = float(grid[1] - grid[0])
+    by_force = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
+    return filled_velocity(values["velocity"], by_force, round(2.0 * velocity_period / period))
+
+
+def _at_fastest_rate(name: str, grid: Array, values: dict[str, Any]) -> tuple[Array, dict[str, Any], list[str]]:
+    """The grid, the values on it and a note: means of so many samples that they come at `FASTEST_RATE` or less."""
+    period = float(grid[1] - grid[0])
+    size = int(1.0 / (FASTEST_RATE * period))
+    if size <= 2 or len(grid) <= 10 * size:
+        return grid, values, []
+    odd_size = size
+    if size % 2 == 0:
+        odd_size = size - 1
+    mean_grid, means = _block_means(grid, values, odd_size)
+    _normalise_rows(means["attitude"])
+    mean_rate = 1.0 / (mean_grid[1] - mean_grid[0])
+    return mean_grid, means, [f"{name}: {1.0 / period:.0f} Hz, of which means at {mean_rate:.0f} Hz are used"]
+
+
 def _normalise_rows(quaternions: Array) -> None:
+    """Scale quaternions (N, 4) to norm 1, in place."""
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
 
 
 def _without_failed_samples(name: str, series: dict[str, Column]) -> tuple[dict[str, Column], list[str]]:
-    """Return the series without samples that a clock, a sensor or a radio spoilt, and a note of each fault."""
+    """Return the series without samples that a clock, a sensor or a radio corrupted, and a note of each fault."""
     series, repeats = _without_repeated_times(name, series)
     for field, column in series.items():
         if field != "voltage":
@@ -259,7 +286,7 @@ def _without_failed_samples(name: str, series: dict[str, Column]) -> tuple[dict[
 
 
 def _without_empty(series: Mapping[str, Column]) -> dict[str, Column]:
-    """The series without a position or rotors' outputs of which no row is whole."""
+    """The series; a position or rotors' outputs without a single complete row are left out."""
     kept = {}
     for field, column in series.items():
         optional = field == "position" or field in ROTOR_INPUTS
@@ -269,9 +296,9 @@ def _without_empty(series: Mapping[str, Column]) -> dict[str, Column]:
 
 
 def _with_motion(name: str, series: Mapping[str, Column], force: Column | None) -> tuple[dict[str, Column], list[str]]:
-    """Return the series with a velocity and a continuous attitude, derived where none is logged, and a note of each.
+    """Return the series with a velocity and a continuous attitude, and a note of each that had to be derived.
 
-    Without velocity and position, the specific force stands in the velocity's place.
+    Without velocity and position, the specific force takes the velocity's place, to be integrated later.
     """
     result = dict(series)
     notes = []
@@ -296,8 +323,11 @@ def _with_motion(name: str, series: Mapping[str, Column], force: Column | None) 
     return result, notes
 
 
-def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array, dict[str, Any]]:
-    """The mean of every `size` samples, odd, about their middle; of what is held, from there to the next middle."""
+def _block_means(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array, dict[str, Any]]:
+    """The middle times of blocks of `size` samples, odd, and the means of the values over each block.
+
+    Inputs that are held act from their sample on: their mean is that from the middle of a block to the next middle.
+    """
     count = len(grid) // size - 1
     half = size // 2
     means = {}
@@ -311,7 +341,10 @@ def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array
 
 
 def _without_repeated_times(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], list[str]]:
-    """Return the series without rows that repeat a time, and a note of each clock; not where most rows do."""
+    """Return the series without rows that repeat a time, and a note of each clock.
+
+    A clock that repeats most of its times is too coarse, and stays as it is.
+    """
     first_rows: dict[int, NDArray[np.bool_]] = {}  # of each clock, the rows that repeat no time
     new_clocks: dict[int, Array] = {}
     notes = []
@@ -335,6 +368,7 @@ def _without_repeated_times(name: str, series: Mapping[str, Column]) -> tuple[di
 
 
 def _check_clock(name: str, field: str, t: Array) -> None:
+    """Refuse a clock that is too short, goes back or stands still."""
     steps = np.diff(t)
     if t.size < 2 or not np.isfinite(t).all():
         raise InputError(f"{name}: {field} needs at least 2 samples, each with a finite time; got {t.size} rows")
@@ -376,7 +410,7 @@ def _usual_period(t: Array) -> float:
 
 
 def _clock(name: str, series: Mapping[str, Column]) -> Array:
-    """The common clock: the slowest of rates and rotors' outputs, uniform, where all fields have samples."""
+    """The common uniform clock: that of rates or rotors' outputs, the slower, while all fields have samples."""
     slower = _slower_clock(name, series)
     period = _usual_period(slower)
     _check_steps(name, slower, period)
@@ -384,8 +418,8 @@ def _clock(name: str, series: Mapping[str, Column]) -> Array:
     stop = min(column.t[-1] for column in series.values())
     if stop - start < 2.0 * period:
         raise InputError(f"{name}: its fields share no time: the last starts at {start:.6g} s, one ends at {stop:.6g}")
-    shared = all(column.t is slower for column in series.values())
-    if shared and _make_uniform(slower, period):
+    is_shared = all(column.t is slower for column in series.values())
+    if is_shared and _make_uniform(slower, period):
         return slower
     samples = int((stop - start) / period + 1e-6) + 1
     return np.asarray(start + period * np.arange(samples))

@@ -1,6 +1,6 @@
-"""The result of `quadsim identify`: the vehicle, what its numbers are worth, and what to fly for the rest.
+"""The result of `quadsim identify`: the vehicle, how well it predicts, and what to fly for the rest.
 
-`identify_logs` is the whole chain: logs, records, checks, fit, prediction of what was held out, vehicle file and page.
+`identify_logs` goes all the way: logs, records, checks, fit, prediction of what was held out, vehicle file and page.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from quadsim.features.identify.identification_figures import (
 )
 from quadsim.features.identify.log_errors import fitting_errors
 from quadsim.features.identify.prediction import (
+    BASELINES,
     HORIZONS,
     JUDGED,
     QUANTITIES,
-    RIVALS,
     PredictionErrors,
     hold_out,
     predict,
@@ -64,7 +64,7 @@ class IdentifiedVehicle(Tabular):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The vehicle as its file has it, but for rounding."""
+        """The vehicle of the file, before its numbers are rounded."""
         return self.identification.vehicle
 
     @property
@@ -94,18 +94,18 @@ class IdentifiedVehicle(Tabular):
 
     @property
     def settings(self) -> dict[str, str]:
-        """What is certainly not zero and has no field in a vehicle file: values by field of a scenario."""
-        certain = {}
+        """Values by field of a scenario: numbers that a vehicle file has no field for and whose interval excludes 0."""
+        nonzero = {}
         for estimate in self.identification.estimates:
             may_be_zero = estimate.low <= 0.0 <= estimate.high
             if not (estimate.in_file or estimate.refused or may_be_zero):
-                certain[estimate.name] = rounded(estimate.value, estimate)
+                nonzero[estimate.name] = rounded(estimate.value, estimate)
         settings = {}
-        delay = certain.get("delay", 0.0)
+        delay = nonzero.get("delay", 0.0)
         if delay > 0.0:
             settings["computation.delay"] = f"{delay:g}"
-        x = certain.get("offset_x", 0.0)
-        y = certain.get("offset_y", 0.0)
+        x = nonzero.get("offset_x", 0.0)
+        y = nonzero.get("offset_y", 0.0)
         if x or y:
             settings["effects.load.centre_of_mass"] = f"[{x:g}, {y:g}, 0]"
         return settings
@@ -113,8 +113,8 @@ class IdentifiedVehicle(Tabular):
     def tables(self) -> tuple[Grid, Grid, Grid]:
         """Return the parameters, the disturbance, and the errors of the prediction."""
         known = self.identification
-        parameter_lines = tuple(_parameter(estimate, known) for estimate in known.estimates)
-        disturbance_lines = tuple(_disturbance(estimate) for estimate in known.disturbance)
+        parameter_lines = tuple(_parameter_line(estimate, known) for estimate in known.estimates)
+        disturbance_lines = tuple(_disturbance_line(estimate) for estimate in known.disturbance)
         note = ""
         if known.whiteness:
             white = ", ".join(f"{axis} {value:.2f}" for axis, value in known.whiteness.items())
@@ -131,12 +131,12 @@ class IdentifiedVehicle(Tabular):
             title="Disturbance",
             head=("not modelled", "unit", "deviation", "95 % interval", "lasts [s]", "95 % interval", "verdict"),
             lines=disturbance_lines,
-            note="Random torque about body axes and force along world axes, wind's included. It is forgotten with the "
-            "time constant in seconds.",
+            note="Random torque about body axes and force along world axes, wind's included. It decays with the time "
+            "constant in seconds.",
         )
-        return parameters, disturbance, self._errors()
+        return parameters, disturbance, self._error_table()
 
-    def _errors(self) -> Grid:
+    def _error_table(self) -> Grid:
         """Return the mean errors of each model by quantity and horizon, the least of them marked."""
         lines = []
         for j, (quantity, si) in enumerate(QUANTITIES.items()):
@@ -154,9 +154,9 @@ class IdentifiedVehicle(Tabular):
             head=("mean error", "horizon", *self.prediction.errors),
             lines=tuple(lines),
             note=f"{self.prediction.windows} windows of {held_out}. identified: starts with the torque and force that "
-            "a filter knows at that instant; undisturbed: without. start: the start file with the same filter. rates "
-            f"held, rates decay: identified thrust and drag alone; decay with {rates_last:.2g} s, as in what was "
-            "fitted. floor: what the identified disturbance leaves open to any prediction.",
+            "a filter estimates at that instant; undisturbed: without. start: the start file with the same filter. "
+            f"rates held, rates decay: identified thrust and drag alone; decay with {rates_last:.2g} s, as in what was "
+            "fitted. floor: the error that the identified disturbance causes to any prediction.",
         )
 
     def records(self) -> list[dict[str, Any]]:
@@ -185,7 +185,7 @@ class IdentifiedVehicle(Tabular):
         yield from self.sentences()
 
     def sentences(self) -> tuple[str, ...]:
-        """Return what the checks noted, what to fly, and what a scenario has to be told."""
+        """Return what the checks noted, what to fly, and the settings that only a scenario has a field for."""
         sentences = [f"check: {note}" for note in self.notes]
         for quantity in self.prediction.at_floor:
             sentences.append(
@@ -215,7 +215,10 @@ class IdentifiedVehicle(Tabular):
         if self.page is not None:
             yield console.to_open(self.page)
         if self.file is None:
-            yield f"no vehicle file was written: --out mine.toml{' --anyway' * bool(self.prediction.lost)} writes it"
+            options = "--out mine.toml"
+            if self.prediction.lost:
+                options += " --anyway"
+            yield f"no vehicle file was written: {options} writes it"
         elif not self.prediction.lost:
             yield console.command(f"{console.to_open(self.file, 'quadsim scenario --for')} > first.toml")
             settings = [f" --set {shlex.quote(f'{field}={value}')}" for field, value in self.settings.items()]
@@ -227,8 +230,8 @@ class IdentifiedVehicle(Tabular):
         for model, of_model in self.prediction.errors.items():
             errors[model] = {quantity: of_model[:, j] for j, quantity in enumerate(QUANTITIES)}
         verdict: dict[str, Any] = {"better": not self.prediction.lost, "text": self.prediction.verdict}
-        for rival in RIVALS:
-            verdict[rival] = self.prediction.ratios(rival)
+        for baseline in BASELINES:
+            verdict[baseline] = self.prediction.ratios(baseline)
         data = {
             "logs": self.logs,
             "test": self.test,
@@ -248,8 +251,8 @@ class _Usable(NamedTuple):
     """A log that can be used."""
 
     record: Record
-    spans: list[slice]  # in the air
-    notes: tuple[str, ...]
+    spans: list[slice]  # of its samples, in the air
+    notes: tuple[str, ...]  # of the checks
 
 
 def identify_logs(
@@ -294,14 +297,20 @@ def identify_logs(
         file=file,
         page=page,
     )
-    if file is not None:
-        with writing_file(file, overwrite=overwrite) as new:
-            new.write_text(result.content, encoding="utf-8")
-            load_vehicle(new)  # the numbers as they are rounded
-    if page is not None:
-        with after(replace(result, page=None), page), writing_file(page, overwrite=overwrite) as new:
-            new.write_text(_render(result), encoding="utf-8")
+    _write(result, overwrite=overwrite)
     return result
+
+
+def _write(result: IdentifiedVehicle, *, overwrite: bool) -> None:
+    """Write the vehicle file and the page, where they were asked for."""
+    if result.file is not None:
+        with writing_file(result.file, overwrite=overwrite) as new:
+            new.write_text(result.content, encoding="utf-8")
+            load_vehicle(new)  # raises where the numbers, as they are rounded, make no vehicle
+    if result.page is not None:
+        without_page = replace(result, page=None)
+        with after(without_page, result.page), writing_file(result.page, overwrite=overwrite) as new:
+            new.write_text(_render(result), encoding="utf-8")
 
 
 def _fit_and_predict(
@@ -334,6 +343,7 @@ def _fit_and_predict(
 
 
 def _refuse_same_flights(logs: Sequence[_Usable]) -> None:
+    """Refuse two logs with the same body rates, which would count twice."""
     for one, other in itertools.combinations(logs, 2):
         if np.array_equal(one.record.rates, other.record.rates):
             raise InputError(f"{one.record.name} and {other.record.name} are the same flight: name it once")
@@ -387,7 +397,7 @@ def _render(result: IdentifiedVehicle) -> str:
     )
 
 
-def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell, ...]:
+def _parameter_line(estimate: ParameterEstimate, known: Identification) -> tuple[Cell, ...]:
     """Return a line of the table of parameters."""
     if estimate.start is None:
         start = ABSENT
@@ -398,7 +408,7 @@ def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell
     return line(estimate.name, estimate.unit, start, value, interval_text(estimate), judged)
 
 
-def _disturbance(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:
+def _disturbance_line(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:
     """Return a line of the table of disturbances."""
     name = f"{estimate.kind} {estimate.axis}"
     if estimate.refused:

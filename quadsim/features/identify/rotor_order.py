@@ -1,7 +1,7 @@
 """Which rotor is which: does another order or layout of the rotors explain the angular acceleration better?
 
 Roll and pitch acceleration are fitted, block by block, as gain * sum of arm_i w_i^2 with the arms of every order of the
-rotors, in plus and in X layout.  One of the checks before any fit, which trusts axes, scales and clocks.
+rotors, in plus and in X layout.  One of the checks before any fit, which relies on those of axes, scales and clocks.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 ACCELERATION_WINDOW: Final = 0.02  # [s] of an angular acceleration
 LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried
-BLOCK: Final = 1.0  # [s] in each of which an order must prove itself
-AGREEING: Final = 0.8  # share of blocks
+BLOCK: Final = 1.0  # length [s] of the blocks in which orders are compared
+AGREEING: Final = 0.8  # share of blocks that another order must explain better
 INFERIOR: Final = 0.85  # of what the best order explains, at most, by the one given
 EXPLAINED: Final = 0.1  # least share of roll and pitch acceleration that an order must explain to count
 YAW_EXPLAINED: Final = 0.05  # the same of yaw, by reversed spins
@@ -49,31 +49,43 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
         blocks = [_moments(record, parts, lag) for lag in LAGS]
     else:
         blocks = [_moments(record, parts, 0.0)]
-    as_given = _best(blocks, _arms(vehicle, 0.0))
-    best = as_given
-    best_order = tuple(range(N_ROTORS))
-    best_turn = 0.0
+    as_given = _explained_at_best_lag(blocks, _arms(vehicle, 0.0))
+    best = _best_arrangement(blocks, vehicle, as_given)
+    share = best.explained.mean()
+    share_as_given = as_given.mean()
+    is_far_better = share > EXPLAINED and share_as_given < INFERIOR * share
+    if is_far_better and (best.explained > as_given).mean() >= AGREEING:
+        if best.turn:
+            advice = _layout_advice(best.order, vehicle)
+        else:
+            advice = _order_advice(best.order, vehicle, record)
+        raise InputError(
+            f"{record.name}: {advice}, which explains {100.0 * share:.0f} % of the roll and pitch acceleration "
+            f"(as given: {100.0 * share_as_given:.0f} %)"
+        )
+    _check_spins(record.name, blocks, vehicle)
+
+
+class _Arrangement(NamedTuple):
+    """An order and a layout of the rotors."""
+
+    order: tuple[int, ...]  # the logged rotor at each place of the vehicle's
+    turn: float  # of the layout [rad]
+    explained: Array  # (K,) share of roll and pitch acceleration in each block
+
+
+def _best_arrangement(blocks: Sequence[Moments], vehicle: Vehicle, as_given: Array) -> _Arrangement:
+    """The order and layout that explain most; those given, which explain `as_given` (K,), if none explains more."""
+    best = _Arrangement(tuple(range(N_ROTORS)), 0.0, as_given)
     for turn in (0.0, math.pi / 4.0):
         turned_arms = _arms(vehicle, turn)
         for order in permutations(range(N_ROTORS)):
             arms = np.empty((2, N_ROTORS))
             arms[:, order] = turned_arms
-            explained = _best(blocks, arms)
-            if explained.mean() > best.mean() + 1e-9:
-                best = explained
-                best_order = order
-                best_turn = turn
-    is_far_better = best.mean() > EXPLAINED and as_given.mean() < INFERIOR * best.mean()
-    if is_far_better and (best > as_given).mean() >= AGREEING:
-        if best_turn:
-            advice = _layout_advice(best_order, vehicle)
-        else:
-            advice = _order_advice(best_order, vehicle, record)
-        raise InputError(
-            f"{record.name}: {advice}, which explains {100.0 * best.mean():.0f} % of the roll and pitch acceleration "
-            f"(as given: {100.0 * as_given.mean():.0f} %)"
-        )
-    _check_spins(record.name, blocks, vehicle)
+            explained = _explained_at_best_lag(blocks, arms)
+            if explained.mean() > best.explained.mean() + 1e-9:
+                best = _Arrangement(order, turn, explained)
+    return best
 
 
 def explained_at_lag(record: Record, parts: Sequence[slice], vehicle: Vehicle, lag: float) -> Array:
@@ -113,14 +125,17 @@ def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
     return Moments(xx=x.transpose(0, 2, 1) @ x, xa=x.transpose(0, 2, 1) @ a, aa=np.square(a).sum(axis=1))
 
 
-def _best(blocks: Sequence[Moments], arms: Array) -> Array:
+def _explained_at_best_lag(blocks: Sequence[Moments], arms: Array) -> Array:
     """Share (K,) of roll and pitch acceleration that arms (2, 4) explain in each block, at the best lag."""
     by_lag = [_explained(of_lag, arms) for of_lag in blocks]
     return max(by_lag, key=lambda shares: float(shares.mean()))
 
 
 def _explained(blocks: Moments, arms: Array) -> Array:
-    """The same at one lag, with one positive gain per axis for all blocks."""
+    """The same at one lag, with one positive gain per axis for all blocks.
+
+    With the torque m = sum of arm_i w_i^2 and the gain g of least squares, it is (2 g m a - g^2 m^2) / a^2.
+    """
     along = np.einsum("ij,kji->ki", arms, blocks.xa[:, :, :2])
     power = np.einsum("ij,kjl,il->ki", arms, blocks.xx, arms)
     gain = np.maximum(along.sum(axis=0) / np.maximum(power.sum(axis=0), 1e-30), 0.0)

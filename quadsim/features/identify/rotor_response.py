@@ -26,7 +26,7 @@ CORNER: Final = 6.0  # [Hz], a tenth of the log's rate if that is less
 _EDGE: Final = 0.5  # [s] at the ends of a segment that the filter disturbs
 _LEAST_SAG: Final = 0.005  # share of the voltage that it must change by to show what it does
 _DELAY: Final = 2  # place of the delay in x, behind the two lags
-_PERIOD_DEVIATION: Final = 0.25  # of the delay, in periods: a log does not tell when in a period a command comes
+_PERIOD_DEVIATION: Final = 0.25  # of the delay, in periods: a log does not show when in a period a command comes
 
 
 class RotorResponse(NamedTuple):

@@ -67,7 +67,8 @@ def _outlier(ratios: Array) -> tuple[int, float]:
 def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
     """Find a rotor whose speeds, were they scaled, would balance the mean yaw torque and the tilting ones at once.
 
-    Sum spin_j b_j w_j^2 = 0 gives the scale; the centre of mass, sum r_j b_j w_j^2 / sum b_j w_j^2, tells the rotor.
+    Sum spin_j b_j w_j^2 = 0 gives the scale; the centre of mass, sum r_j b_j w_j^2 / sum b_j w_j^2, shows which rotor
+    it is.
 
     Raises:
         InputError: there is one.
@@ -101,9 +102,9 @@ def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Ve
 
 
 def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
-    """Tell measured speeds from commands: the vehicle turns as they are, not as they were a rotor's lag ago.
+    """Distinguish measured speeds from commands: the vehicle turns as they are, not as they were a rotor's lag ago.
 
-    A lag takes noise away too; the speeds as they are may do so by a filter without lag.
+    A lag removes noise too, so the speeds without lag are also tried through filters without phase shift.
 
     Raises:
         InputError: behind a lag they explain roll and pitch far better.
@@ -131,7 +132,7 @@ def _best_explained(shares: Sequence[Array]) -> tuple[int, Array]:
 
 
 def _filtered(record: Record, parts: Sequence[slice], tau: float) -> Record:
-    """The record with its speeds through a first-order filter of a time constant [s], forth and back."""
+    """The record with its speeds through a first-order filter of a time constant [s], forward and backward."""
     speeds = np.asarray(record.speeds).copy()
     pole = math.exp(-record.period / tau) if tau else 0.0
     for part in parts:

@@ -1,7 +1,7 @@
 """Scales of a log: columns that say the same of one motion, and gravity, must agree in size, not only in sign.
 
 A factor k of b = k a + noise lies between cov(a, b) / var(a) and var(b) / cov(a, b), whichever of the two is noisy; a
-column is called wrong only where both bounds are.  One of the checks before any fit, which trusts the axes.
+column is called wrong only where both bounds are.  One of the checks before any fit, which relies on that of the axes.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def check_scales(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> No
             f"{name}: vx, vy change {tilt_factor.value:.3g} times as fast as tilt and gravity make them"
             f"{_likely(tilt_factor.value, 'speed')}; give them in m/s, and t in s"
         )
-    # Gravity speaks for the velocity: small differences are the position's.
+    # Gravity confirms the velocity, so that a small difference is an error of the position.
     if velocity is not None and velocity.off(_TOLERANCE_OF_ONE):
         factor = 1.0 / velocity.value
         likely = ""
@@ -120,7 +120,7 @@ def _moving(record: Record, parts: Sequence[slice], position: Array) -> Pairs:
 def _refuse_clock_or_attitude(
     record: Record, gyro: ScaleFactor, velocity: ScaleFactor | None, tilt: ScaleFactor | None
 ) -> None:
-    """Refuse a clock or an attitude that a second factor, of velocity or tilt, tells from a gyro that is off."""
+    """Refuse a clock or an attitude that is off where a second factor, of velocity or tilt, excludes the gyro."""
     by_position = velocity is not None and velocity.like(gyro.value, _NEAR)
     by_gravity = tilt is not None and tilt.like(1.0 / gyro.value, _NEAR)
     if by_position or by_gravity:

@@ -30,7 +30,7 @@ from quadsim.fields import floor_of
 from quadsim.state import Array, Indices
 from quadsim.vehicle import LARGEST, VEHICLE_UNITS, Vehicle
 
-SETTLING: Final = 0.5  # time [s] after a segment begins until the rotors have forgotten the speeds assumed there
+SETTLING: Final = 0.5  # time [s] after a segment begins until the rotor speeds assumed there have decayed
 LONGEST_FORCE: Final = 2.0
 """Time [s] that an unknown force lasts: one that may last for ever would carry the weight in the thrust's place."""
 LIFT_DEVIATION: Final = 0.002
@@ -219,7 +219,7 @@ class Search:
         deviations += [_REFLECTION_DEVIATION] * len(reflections)
         deviations += [_FIRST_ERROR_DEVIATION] * len(first_errors)
         self._weights = np.array([_weight(deviation) for deviation in deviations])
-        self._fading = math.exp(-segments[0].step / LONGEST_FORCE)
+        self._force_decay = math.exp(-segments[0].step / LONGEST_FORCE)
         self._skip = []  # how many increments of each segment begin before its rotors have settled
         for segment in segments:
             settled = int(SETTLING / segment.record.period)
@@ -284,8 +284,8 @@ class Search:
         reflections = x[noise.start : noise.stop]
         top = _polynomial(np.tanh(reflections[:_ORDER]))
         bottom = _polynomial(np.tanh(reflections[_ORDER:]))
-        if axis >= 3:  # of a force, A forgets within `LONGEST_FORCE`
-            top = self._fading ** np.arange(_ORDER + 1) * top
+        if axis >= 3:  # of a force, A decays within `LONGEST_FORCE`
+            top = self._force_decay ** np.arange(_ORDER + 1) * top
         return np.asarray(lfilter(top, bottom, misfit, axis=0))
 
     def _noise_places(self, index: int, axis: int) -> range:

@@ -1,7 +1,7 @@
-"""Samples that a sensor, a counter or a radio spoilt: jumps away and back, counters that stop, rows that are held.
+"""Samples that a sensor, a counter or a radio corrupted: jumps away and back, counters that stop, rows that are held.
 
-A jump is farther from the median about it than 1.5 ranges of all medians.  Such samples are cut before `record` samples
-anything anew, averages or fits it, and a note names sensor, time and value; a sensor that fails too often makes the log
+A jump is farther from the median about it than 1.5 ranges of all medians.  Such samples are cut before `record`
+resamples and averages anything, and a note names sensor, time and value; a sensor that fails too often makes the log
 one that cannot be used.
 """
 
@@ -20,8 +20,8 @@ from quadsim.state import Array
 
 LONGEST_SPIKE: Final = 3  # samples, of which a log with a sample in `SPIKE_TIME` or more has one
 SPIKE_TIME: Final = 0.03  # [s]: what lasts longer may be flown
-FARTHEST: Final = 1.5  # how far a sample may be from the median about it, in ranges of all medians
-LOUDEST: Final = 8.0  # the same in median distances, where a column hardly changes
+SPIKE_OVER_RANGE: Final = 1.5  # how far a sample may be from the median about it, in ranges of all medians
+SPIKE_OVER_NOISE: Final = 8.0  # what it may be farther, in median distances: a column may hardly change
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
 LEAST_DROP: Final = 0.05  # share of a battery's voltage below which a change is no jump: it is logged to 0.1 V
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
@@ -36,7 +36,7 @@ SLOWS_DOWN: Final = 0.1  # [s] for which such a command must last
 MOST_STOPPED: Final = 0.05  # share of the flight in which a counter may have stopped
 ROUNDING: Final = 1e-9  # [rad, rad/s, m/s]: below it, nothing has changed
 SLOWEST_FRESH: Final = 20.0  # [Hz] at which rows must be new
-HELD_TOO: Final = 0.9  # share of the held rows in which a column repeats that is held with them
+HELD_TOO: Final = 0.9  # share of the held rows in which a column repeats, from which on it counts as held too
 
 
 class _Sensor(NamedTuple):
@@ -110,7 +110,7 @@ def _spike_note(name: str, field: str, samples: Column, column: int, spikes: NDA
     if count > MOST_CUT * len(spikes):
         raise InputError(
             f"{what}, far from the samples beside; at most {MOST_CUT:.0%} of a sensor's samples may jump:"
-            " mend or leave out that sensor"
+            " correct or leave out that sensor"
         )
     return f"{what}, far from the samples beside: left out"
 
@@ -143,7 +143,7 @@ def _column_spikes(samples: Column, *, command: bool = False, least: float = 0.0
         spikes[there] = np.abs(rows) > COMMANDS_APART * np.abs(middle).max()
         return spikes
     distance = np.abs(rows - middle)
-    farthest = FARTHEST * np.ptp(middle, axis=0) + LOUDEST * np.median(distance, axis=0)
+    farthest = SPIKE_OVER_RANGE * np.ptp(middle, axis=0) + SPIKE_OVER_NOISE * np.median(distance, axis=0)
     farthest = np.maximum(farthest, least * np.abs(middle).max(axis=0))
     spikes[there] = distance > farthest + ROUNDING
     return spikes
@@ -176,8 +176,8 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
 def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
     """Return the series of a log without rows that a radio held: rates and attitude as in the row before.
 
-    A series `fresh` says which rows are new, and of which something of the rotors is known; the others are NaN, of
-    commands that were held with them linear.
+    A series `fresh` has two columns of 1 and 0: whether a row is new, and whether it has new values of the rotors.
+    Held rows are NaN, but for commands that were held too, which are interpolated.
 
     Raises:
         InputError: fewer than `SLOWEST_FRESH` rows per second are new.
@@ -240,8 +240,9 @@ def _fresh_rate(series: Mapping[str, Column], repeated: NDArray[np.bool_]) -> fl
 def at_rest(still: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
     """Steps (N - 1,) at which a vehicle rests, of those at which nothing turns.
 
-    A row that is held is followed by one that has moved, and a row that is held again: it is between steps that turn.
-    Rest lasts from the log's first step on, or to its last, or longer than `longest` steps until more than one turns.
+    A radio that holds rows repeats each a few times, with single steps that turn in between.  A vehicle rests in a run
+    of still steps that includes the log's first or last one, or is longer than `longest` with two turning steps on
+    both sides.
     """
     rest = np.zeros_like(still)
     for run in runs(still):
@@ -285,9 +286,9 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
             f"t = {t[row]:.6g} s on while the others turn at {others:.4g}, in {share:.1%} of the time that they turn"
         )
         if share > MOST_STOPPED:
-            advice = "mend it"
+            advice = "correct it"
             if "commands" in series or "throttle" in series:
-                advice = "mend it, or name the commands alone"
+                advice = "correct it, or name the commands alone"
             raise InputError(f"{what}: its counter is dead, at most {MOST_STOPPED:.0%} is allowed: {advice}")
         notes.append(f"{what}: left out")
     result["speeds"] = Column(t=t, values=values)

@@ -49,7 +49,7 @@ _TIMES: Final = (
     replace(logged_as("t", "t_us", unit="us"), columns=("time (us)",)),  # as blackbox_decode writes it
 )
 _TIMES_OF_ANY_UNIT: Final = ("time", "timestamp")
-"""Columns of time in s, ms or us: their step tells which, as a log has 10 to 1000 samples per second."""
+"""Columns of time in s, ms or us: their step shows which, as a log has 10 to 1000 samples per second."""
 
 
 def _names_of(quantities: Iterable[NamedQuantity]) -> set[str]:

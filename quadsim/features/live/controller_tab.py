@@ -9,7 +9,7 @@ from typing import Any
 
 from quadsim.errors import InputError
 from quadsim.features.live import readout
-from quadsim.features.live.knobs import TURNED_FIELDS, Knob, KnobValue, knobs
+from quadsim.features.live.tunable_fields import MAIN_FIELDS, FieldValue, TunableField, tunable_fields
 from quadsim.features.live.widgets import Widgets
 from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.scenarios.schema.writing import plain
@@ -28,7 +28,7 @@ class ControllerTab:
         self._session = widgets.session
         self._doing = doing
         self._laws = {"initial": self._session.scenario.controller, **others}
-        self._values: dict[str, KnobValue] = {}  # by path, as they fly
+        self._values: dict[str, FieldValue] = {}  # by path, as they fly
         self._groups: list[Any] = []  # folders of fields
         chosen = widgets.gui.add_dropdown("Controller", tuple(self._laws))
         widgets.button("Use this controller", lambda event: self._take(event, chosen.value))
@@ -42,21 +42,21 @@ class ControllerTab:
         self._show(self._session.scenario.controller)
 
     def _show(self, spec: AnyController) -> None:
-        """Show the fields of a controller, those that people turn first."""
+        """Show the fields of a controller, with the most used ones first."""
         while self._groups:
             self._groups.pop().remove()
-        fields = {knob.path: knob for knob in knobs(spec)}
-        self._values = {path: knob.value for path, knob in fields.items()}
-        for title, labels in TURNED_FIELDS.items():
+        fields = {field.path: field for field in tunable_fields(spec)}
+        self._values = {path: field.value for path, field in fields.items()}
+        for title, labels in MAIN_FIELDS.items():
             group = []
             for path, label in labels.items():
                 if path in fields:
                     group.append((fields.pop(path), label))
             self._add_group(title, group, expanded=True)
-        rest = [(knob, knob.path) for knob in fields.values()]
+        rest = [(field, field.path) for field in fields.values()]
         self._add_group("All fields", rest, expanded=False)
 
-    def _add_group(self, title: str, group: Sequence[tuple[Knob, str]], *, expanded: bool) -> None:
+    def _add_group(self, title: str, group: Sequence[tuple[TunableField, str]], *, expanded: bool) -> None:
         """Add a folder of fields with their labels; none without fields."""
         if not group:
             return
@@ -64,31 +64,31 @@ class ControllerTab:
             folder = self._widgets.gui.add_folder(title, expand_by_default=expanded)
         self._groups.append(folder)
         with folder:
-            for knob, label in group:
-                self._widgets.on(self._input(knob, label).on_update, partial(self._turn, knob.path))
+            for field, label in group:
+                self._widgets.on(self._input(field, label).on_update, partial(self._change_field, field.path))
 
-    def _input(self, knob: Knob, label: str) -> Any:
+    def _input(self, field: TunableField, label: str) -> Any:
         """The widget of a field."""
         gui = self._widgets.gui
-        limits = {"min": knob.minimum, "max": knob.maximum}
-        match knob.value:
+        limits = {"min": field.minimum, "max": field.maximum}
+        match field.value:
             case bool(value):
-                return gui.add_checkbox(label, value, hint=knob.about)
+                return gui.add_checkbox(label, value, hint=field.about)
             case str(value):
-                return gui.add_dropdown(label, knob.choices, initial_value=value, hint=knob.about)
+                return gui.add_dropdown(label, field.choices, initial_value=value, hint=field.about)
             case tuple(value):
                 limits_of_pair = {}
                 for name, limit in limits.items():
                     if limit is not None:
                         limits_of_pair[name] = (limit, limit)
-                return gui.add_vector2(label, value, step=0.1, hint=knob.about, **limits_of_pair)
+                return gui.add_vector2(label, value, step=0.1, hint=field.about, **limits_of_pair)
             case int(value):
-                return gui.add_number(label, value, step=1, hint=knob.about, **limits)
+                return gui.add_number(label, value, step=1, hint=field.about, **limits)
             case value:
-                return gui.add_number(label, value, hint=knob.about, **limits)
+                return gui.add_number(label, value, hint=field.about, **limits)
 
-    async def _turn(self, path: str, event: Any) -> None:
-        """Let a controller take over that has a field as a person has turned it; put it back if that fails."""
+    async def _change_field(self, path: str, event: Any) -> None:
+        """Let a controller with a changed field take over; show its value before if that fails."""
         widget = event.target
         value = widget.value
         before = self._values.get(path)

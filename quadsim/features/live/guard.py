@@ -3,7 +3,8 @@
 Viser has no hook for this, and a second server in front of it would leave its own port open to every page that finds
 it.  So the guard stands where viser's server is made, in the function `serve` of the public module
 `websockets.asyncio.server`, which checks each request before viser sees it.  A viser that makes its server in another
-way would be unguarded: `Guard.require_closed` therefore tries the door before anything is shown, and refuses.
+way would be unguarded: `RequestGuard.require_closed` therefore tests it, with requests without the token, before
+anything is shown.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _ANSWER_TIME: Final = 10.0  # [s] for an answer of this process
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
-class Guard:
+class RequestGuard:
     """Checks requests to a server that listens on a host; the address has to have its `token`.
 
     A browser lets any site connect to servers on the loopback interface, so that each request is checked: `Host`
@@ -61,7 +62,7 @@ class Guard:
         return None
 
     @contextlib.contextmanager
-    def installed(self, dress: Callable[[str], str]) -> Iterator[None]:
+    def installed(self, adapt: Callable[[str], str]) -> Iterator[None]:
         """Make a server of `websockets` that is started in this block check its requests, and change its page."""
         import websockets.asyncio.server  # of the extra `live`, as viser
 
@@ -69,7 +70,7 @@ class Guard:
         serve = library.serve
 
         def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
-            check = partial(self._answer, process_request, dress)
+            check = partial(self._answer, process_request, adapt)
             return serve(*args, process_request=check, **options)
 
         library.serve = guarded
@@ -79,9 +80,9 @@ class Guard:
             library.serve = serve
 
     def _answer(
-        self, process_request: Callable[[Any, Any], Any], dress: Callable[[str], str], connection: Any, request: Any
+        self, process_request: Callable[[Any, Any], Any], adapt: Callable[[str], str], connection: Any, request: Any
     ) -> Any:
-        """Return the response to a request: a refusal, or that of the server, its page dressed; None: a WebSocket."""
+        """Return the response to a request: a refusal, or that of the server, its page adapted; None: a WebSocket."""
         port = connection.local_address[1]
         refusal = self.refusal(request.headers, request.path, port)
         if refusal:
@@ -93,7 +94,7 @@ class Guard:
         if response is None:
             return None
         if response.headers.get("Content-Type", "").startswith("text/html"):
-            response.body = dress(response.body.decode()).encode()
+            response.body = adapt(response.body.decode()).encode()
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         if _tokens(request.path):
@@ -102,10 +103,10 @@ class Guard:
         return response
 
     def require_closed(self, port: int) -> None:
-        """Try the door of the server on this port without the token: with a request for the page, and by WebSocket.
+        """Request the page and a WebSocket of the server on this port without the token, which it has to refuse.
 
         Raises:
-            InputError: it does not refuse both, so whoever finds the port could fly.
+            InputError: it does not refuse both, so that anyone who finds the port could fly.
         """
         address = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
         of_page = _status(address, port, {})

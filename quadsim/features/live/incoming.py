@@ -85,11 +85,11 @@ class Incoming:
         if widget is None:
             return True  # of one client alone
         if not self._drives(client):
-            self._turn_away(client, widget)
+            self._refuse_watcher(client, widget)
             return False
         return set(message.updates) == {"value"} and offers(widget, message.updates["value"])
 
-    def _turn_away(self, client: int, widget: Any) -> None:
+    def _refuse_watcher(self, client: int, widget: Any) -> None:
         """Tell a watching page that it watches, and show it the value that is in force."""
         page = self._server.get_clients().get(client)
         if page is None:

@@ -73,7 +73,7 @@ if (navigator.getGamepads) setInterval(steer, 50)
 """Sticks press the keys that steer, as often as they are deflected; centred again, they stop the set-point."""
 
 
-def dressed(page: str, title: str, *, served: bool = False) -> str:
+def adapted_page(page: str, title: str, *, served: bool = False) -> str:
     """Return viser's page with our title, icon and sky, in the theme of the system.
 
     Where it is `served`, it asks whether it may connect, and shows the reason if it may not; a gamepad steers.
@@ -112,7 +112,7 @@ def obstacle(shape: Obstacle) -> trimesh.Trimesh:
 
 
 def floor(square: float) -> bytes:
-    """Return a checkered floor that fades with distance, as a GLB; unlit, which a machine without a GPU feels.
+    """Return a checkered floor that fades with distance, as a GLB; unlit, which costs less without a GPU.
 
     What is transparent is drawn in the order of its bounding box's middle, from far to near: a vertex without a face,
     far below, lets the floor be the first.

@@ -29,9 +29,9 @@ from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.live import readout
 from quadsim.features.live.controller_tab import ControllerTab
 from quadsim.features.live.disturb_tab import disturb
-from quadsim.features.live.guard import Guard
+from quadsim.features.live.guard import RequestGuard
 from quadsim.features.live.incoming import Incoming
-from quadsim.features.live.look import dressed
+from quadsim.features.live.look import adapted_page
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Frame, Session
 from quadsim.features.live.stage import FIELD, VIEW, Stage
@@ -106,12 +106,12 @@ class Page:
         self._pace = pace
         self._save = save
         title = f"quadsim live: {session.scenario.name}"
-        guard = Guard(host)
+        guard = RequestGuard(host)
         listening = self._serve(guard, title, host, port)
         self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._driver: int | None = None
         Incoming(self._server, self._drives)
-        self._takes: dict[int, list[Any]] = {}  # of each client, what a watcher sees
+        self._watcher_widgets: dict[int, list[Any]] = {}  # of each client: a note and a button, shown to watchers
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
         self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
         self._frame: Frame | None = None
@@ -135,7 +135,7 @@ class Page:
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._left)
 
-    def _serve(self, guard: Guard, title: str, host: str, port: int) -> int:
+    def _serve(self, guard: RequestGuard, title: str, host: str, port: int) -> int:
         """Start the server, which a guard has to protect; return its port.
 
         Raises:
@@ -143,7 +143,7 @@ class Page:
             InputError: the guard does not protect it.
         """
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
-        with silent, guard.installed(partial(dressed, title=title, served=True)):
+        with silent, guard.installed(partial(adapted_page, title=title, served=True)):
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         listening: int = self._server.get_port()
         if port not in (0, listening):
@@ -395,13 +395,13 @@ class Page:
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches, color="orange")
-        self._takes[client.client_id] = [note, take]
+        self._watcher_widgets[client.client_id] = [note, take]
         take.on_click(partial(self._hand_over, client.client_id))
 
     def _follow_with(self, client: Any, aim: Array) -> None:
         """Let a client's camera follow the vehicle, looking at a point from it [m], once its page has it in place.
 
-        A page reports viser's own place before it hears of ours.
+        A page reports viser's own place before it receives ours.
         """
         connected = clock.monotonic()
 
@@ -423,9 +423,9 @@ class Page:
     async def _left(self, client: Any) -> None:
         """Forget a client; another one gets its controls."""
         self._aims.pop(client.client_id, None)
-        self._takes.pop(client.client_id, None)
+        self._watcher_widgets.pop(client.client_id, None)
         if self._driver == client.client_id:
-            await self._hand_over(min(self._takes, default=None))
+            await self._hand_over(min(self._watcher_widgets, default=None))
 
     async def _hand_over(self, driver: int | None, event: Any = None) -> None:
         """Give a client the controls; the pull and the manual set-point end."""
@@ -433,7 +433,7 @@ class Page:
         self._steering.stop()
         self._driver = driver
         with _unless_gone():
-            for client, widgets in self._takes.items():
+            for client, widgets in self._watcher_widgets.items():
                 for widget in widgets:
                     widget.visible = client != driver
 

@@ -7,7 +7,7 @@ import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
@@ -80,21 +80,26 @@ def fly_live(
             hold.flown = True
             if session.k:
                 saving.save(session.flight())
-        text = ""
-        if saving.saved is not None:
-            outcome = next(iter(saving.saved.shown()))
-            for line in (outcome, *saving.saved.outputs()):
-                text += f"{line}\n"
-        facts = {
-            "directory": str(directory),
-            "duration": session.k * session.period,
-            "reason": session.reason,
-            "refused": refused,
-        }
-        status = EXIT_DONE
-        if session.reason is not None or refused:
-            status = EXIT_FAILED
-        return Document(text, facts, status)
+        return _result(session, saving.saved, directory, refused)
+
+
+def _result(session: Session, saved: Flight | None, directory: Path, refused: Sequence[str]) -> Document:
+    """Return what the command prints about a session, and whether it failed: it ended early, or inputs were refused."""
+    text = ""
+    if saved is not None:
+        outcome = next(iter(saved.shown()))
+        for line in (outcome, *saved.outputs()):
+            text += f"{line}\n"
+    facts = {
+        "directory": str(directory),
+        "duration": session.k * session.period,
+        "reason": session.reason,
+        "refused": refused,
+    }
+    status = EXIT_DONE
+    if session.reason is not None or refused:
+        status = EXIT_FAILED
+    return Document(text, facts, status)
 
 
 def _nothing_flown(*, has_page: bool) -> str:

@@ -80,7 +80,7 @@ class _HeldInputs:
     pull: Array | None = None  # (3,) to where [m]
     wear: dict[int, float] = field(default_factory=dict)
     steer: Array = field(default_factory=lambda: np.zeros(3))
-    setpoint: Array | None = None  # (3,) where steering has come to [m]
+    setpoint: Array | None = None  # (3,) the set-point as steering has moved it [m]
 
 
 class Session:
@@ -179,7 +179,7 @@ class Session:
         if self.reason is not None:
             raise InputError(f"the flight has ended: {self.reason}")
         refused = self._apply_queued()
-        if not self._steered and self.k == self._round:  # an arrival, say, was one at the end of the first round
+        if not self._steered and self.k == self._round:  # constraints on its arrival end with the first round
             for flight in self.flights:
                 flight.leave_course()
         pull = self._apply_held(refused)
@@ -340,7 +340,7 @@ class Session:
     def _apply_held(self, refused: list[str]) -> Array:
         """Apply the inputs in force for one more period; return the force of the pull (3,) [N]."""
         last = self.flights[0].loop.last
-        if last is None:  # where the vehicle is shows once a period has been flown
+        if last is None:  # its position is known once a period has been flown
             return np.zeros(3)
         force = self._pull_force(last)
         events: list[dict[str, Any]] = []
@@ -355,8 +355,8 @@ class Session:
         try:
             for event in events:
                 self._apply_event(event)
-        except InputError as error:  # as where a scenario is full of events
-            refused.append(f"{error}; all is let go")
+        except InputError as error:  # such as too many events in the scenario
+            refused.append(f"{error}; all inputs in force are released")
             self._held = _HeldInputs()
             return np.zeros(3)
         return force

@@ -106,14 +106,7 @@ class Stage:
         if is_alone:
             predicted = rgb(COLOUR.predicted)
         frame = self._scene.add_frame(f"{_ROOT}/{name}", show_axes=False)
-        for material, (*paint, alpha), mesh in look.airframe(model):
-            tint: tuple[float, ...] = colour
-            if is_alone or material not in _TINTED:
-                tint = tuple(paint)
-            opacity = None
-            if alpha != 1.0:
-                opacity = alpha
-            self._add(f"{name}/{material}", mesh, tint, opacity=opacity)
+        self._add_airframe(name, model, tint=None if is_alone else colour)
         widths = {"shaft_radius": 0.04 * self.unit, "head_radius": 0.09 * self.unit, "head_length": 0.2 * self.unit}
         points = np.zeros((len(self._rotors), 2, 3))
         arrows = self._scene.add_arrows(f"{_ROOT}/{name}/thrust", points, colour, **widths)
@@ -134,6 +127,17 @@ class Stage:
             self._scene.add_label(f"{_ROOT}/{name}/label", title, position=top, anchor="bottom-center")
             self._line(f"{name}/pole", np.array([[(0.0, 0.0, 0.0), top]]), colour, 1.5)
         return handles
+
+    def _add_airframe(self, name: str, model: mujoco.MjModel, tint: tuple[float, ...] | None) -> None:
+        """Add the meshes of a vehicle, some of them in its own colour if it has a tint."""
+        for material, (*paint, alpha), mesh in look.airframe(model):
+            colour = tuple(paint)
+            if tint is not None and material in _TINTED:
+                colour = tint
+            opacity = None
+            if alpha != 1.0:
+                opacity = alpha
+            self._add(f"{name}/{material}", mesh, colour, opacity=opacity)
 
     def _add_obstacles_and_regions(self) -> None:
         """Add what the flight's limits keep the vehicle out of, or within; regions are cut off around the course."""
@@ -227,15 +231,15 @@ class Stage:
 
         The scene moves instead of the camera: the first vehicle stays in the middle, and a viewer may turn it.
         """
-        tape: Any = WebsockMessageHandler()  # takes the place of a server
-        tape.get_message_buffer = lambda: SimpleNamespace(push=lambda message: None)
-        record = tape.get_message_serializer(lambda message: message.include_in_scene_serialization)
-        camera = viser.InitialCameraConfig(tape.queue_message)
+        messages: Any = WebsockMessageHandler()  # takes the place of a server
+        messages.get_message_buffer = lambda: SimpleNamespace(push=lambda message: None)
+        record = messages.get_message_serializer(lambda message: message.include_in_scene_serialization)
+        camera = viser.InitialCameraConfig(messages.queue_message)
         camera.position = self.unit * VIEW
         camera.look_at = np.zeros(3)
         camera.fov = FIELD
         lock = SimpleNamespace(_scene_lifecycle_lock=threading.RLock())
-        owner: Any = SimpleNamespace(_websock_connection=tape, client_id="", _viser_server=lock)
+        owner: Any = SimpleNamespace(_websock_connection=messages, client_id="", _viser_server=lock)
         frames = list(self._shown)
         idle = SimpleNamespace()
         stage = Stage(viser.SceneApi(owner, idle, idle), self._session)
@@ -244,7 +248,7 @@ class Stage:
             stage._root.position = -stage.pose(frame, 1.0)
             record.insert_sleep(self._session.period)
             clock.sleep(_PAUSE)
-        return look.dressed(record.as_html(), title)
+        return look.adapted_page(record.as_html(), title)
 
     def _line(self, name: str, points: Array, colour: Rgb, thickness: float = 3.0) -> Any:
         style = {"thickness": thickness, "thickness_units": "screen"}

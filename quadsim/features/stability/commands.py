@@ -1,7 +1,7 @@
 """The command `quadsim stability`.
 
-It measures the growth of a small push in hover, and up to which heading, delay, lag, mass, thrust, ... the closed loop
-stays stable.
+It measures how fast a small push in hover grows or decays, and up to which heading, delay, lag, mass, thrust, ... the
+closed loop stays stable.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from quadsim.errors import ParameterError
 from quadsim.features.arguments import Changes, File, Flag, Labels, ScenarioName, Watched, Whole
 
 if TYPE_CHECKING:
+    from quadsim.features.stability.margins import MeasuredLoop
     from quadsim.features.stability.report import Stability
     from quadsim.scenarios.schema.scenario import Scenario
 
@@ -43,7 +44,7 @@ def stability(
 ) -> Stability:
     """Measure the margins of a closed loop: how fast it settles, and what makes it unstable.
 
-    Two flights of one seed hold a hover, one of them pushed a little; the growth of their difference tells whether the
+    Two flights of one seed hold a hover, one of them pushed a little; the growth of their difference shows whether the
     loop is stable, whatever its controller.  Each quantity is then changed in both directions, by bisection to 2 %.
 
     Args:
@@ -53,8 +54,8 @@ def stability(
             whose controller is meant; in Python also classes.
         map: two quantities; the loop is also measured over both together.
         heading: of the nominal hover [deg] (default: the one that the course has most).
-        size: velocity [m/s] of a second, larger push, for which everything is measured, too: how far the region
-            reaches.
+        size: velocity [m/s] of a second, larger push, for which everything is measured too, as a test of the region of
+            attraction.
         out: directory for the table, the figures and summary.json.
         overwrite: replace an earlier output, if its summary.json lists every file in the directory.
         workers: processes (default: one per core).
@@ -84,7 +85,7 @@ def stability(
 
     from quadsim.console.progress import reporting
     from quadsim.console.results import after
-    from quadsim.features.stability.margins import LoopMeasurement, MeasuredLoop
+    from quadsim.features.stability.margins import LoopMeasurement
     from quadsim.features.stability.quantities import quantities_named
     from quadsim.features.stability.report import Stability as Report
     from quadsim.outputs import reserving
@@ -103,11 +104,7 @@ def stability(
         if not abs(heading) <= 180.0:
             raise ParameterError("", "--heading", heading, "within +-180 deg")
         stated = hovering(stated, heading=heading)
-    loops = []
-    for name, flown in _flown(stated, controller):
-        loops.append(MeasuredLoop(name=name, scenario=flown, size=SIZE))
-        if size is not None:
-            loops.append(MeasuredLoop(name=name, scenario=flown, size=size))
+    loops = _loops(stated, controller, size)
     with (
         nullcontext() if out is None else reserving(out, overwrite=overwrite),
         reporting(progress, "the stability check") as report,
@@ -117,7 +114,7 @@ def stability(
         maps = []
         if pair is not None:
             for loop, margins in zip(loops, measured, strict=True):
-                if {*pair} <= {*margins.margins}:
+                if {*pair} <= {*margins.margins}:  # both quantities have a margin
                     maps.append(measurement.map(loop, margins, pair))
     result = Report(scenario=stated.name, loops=tuple(measured), quantities=quantities, maps=tuple(maps))
     if out is None:
@@ -133,6 +130,19 @@ def _pair(names: Sequence[str]) -> tuple[str, str] | None:
     if len(names) != 2 or names[0] == names[1]:
         raise ParameterError("", "--map", list(names), "names of two different quantities")
     return names[0], names[1]
+
+
+def _loops(scenario: Scenario, controllers: object, size: float | None) -> list[MeasuredLoop]:
+    """Return the loop of each controller with the small push, and with one of a `size` [m/s] where it is given."""
+    from quadsim.features.stability.margins import MeasuredLoop
+    from quadsim.rollout.growth import SIZE
+
+    loops = []
+    for name, flown in _flown(scenario, controllers):
+        loops.append(MeasuredLoop(name=name, scenario=flown, size=SIZE))
+        if size is not None:
+            loops.append(MeasuredLoop(name=name, scenario=flown, size=size))
+    return loops
 
 
 def _flown(scenario: Scenario, controllers: object) -> list[tuple[str, Scenario]]:
@@ -173,7 +183,7 @@ def _with_controller(scenario: Scenario, controller: object) -> tuple[str, Scena
 
 
 def _distinct(flown: list[tuple[str, Scenario]]) -> list[tuple[str, Scenario]]:
-    """Number the names that occur several times."""
+    """Return the same with distinct names: `lqr`, `lqr (2)`, ..."""
     names = [name for name, _ in flown]
     numbered = []
     for i, (name, scenario) in enumerate(flown):

@@ -1,8 +1,8 @@
 """The margins of a loop: up to which value of each quantity it is stable, by bisection.
 
 From the nominal value p0 a search goes outwards to the first value at which the growth |d(t)| ~ exp(rate t) of
-`quadsim.rollout.growth` is not negative, then halves the bracket until it is `WIDTH` wide: as a share of the margin
-|p - p0|, or as a logarithm where p is a factor.  `quantities` says what p is, `report` shows what was found.
+`quadsim.rollout.growth` is not negative, then halves the bracket until it is `BRACKET_WIDTH` wide: as a share of the
+margin |p - p0|, or as a logarithm where p is a factor.  `quantities` says what p is, `report` shows what was found.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from quadsim.scenarios.plugin import Plugin
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.ties import first_smallest
 
-WIDTH: Final = 0.02
+BRACKET_WIDTH: Final = 0.02
 """Width of the last bracket: as a share of a margin, or of the value where this is a factor."""
 _OUTWARD_SHARES: Final = (1.0 / 16.0, 1.0 / 8.0, 1.0 / 4.0, 1.0 / 2.0, 1.0)
-"""Of the way to the end of a range, where a search looks first: a loop may be stable again beyond an unstable value."""
-_NARROWEST: Final = 5e-4  # bracket at which a search ends anyway, as a share of the way to the end of the range
+"""Shares of the way from the nominal value to the end of the range, at which a search measures first, in this order: a
+loop may be stable again beyond an unstable value."""
+_NARROWEST: Final = 5e-4  # bracket at which a search ends in any case, as a share of the way to the end of the range
 MAP_POINTS: Final = 9  # values of either quantity in a map
-_MAP_REACH: Final = 1.25  # how far a map reaches, over the margin
+_MAP_REACH: Final = 1.25  # distance from the nominal value to the edge of a map, over the margin
 
 PointState: TypeAlias = Literal["stable", "neutral", "unstable", "no flight"]
 
@@ -52,20 +53,20 @@ class LoopPoint:
 class MarginSide:
     """One side of a margin.
 
-    The loop is stable at `stable`, and at every value looked at between the nominal one and that, and not at
-    `unstable`; this is None where it is stable up to the end of the range.
+    The loop is stable at `stable`, and at every measured value between it and the nominal one.  It is not stable at
+    `unstable`, which is None where the loop is stable up to the end of the range.
     """
 
     stable: float
     unstable: float | None
     state: PointState  # at `unstable`; `stable` where that is None
     why: str  # why the vehicle cannot be flown at `unstable`, or why the flight ended; empty if it did not
-    points: tuple[LoopPoint, ...]  # those that the search looked at, in its order
+    points: tuple[LoopPoint, ...]  # those that the search measured, in its order
 
 
 @dataclass(frozen=True, kw_only=True)
 class Margin:
-    """A quantity's margin on both sides of its nominal value; a side is None where the range ends at that."""
+    """A quantity's margin on both sides of its nominal value; a side is None where the range ends at the nominal."""
 
     quantity: str
     nominal: float
@@ -159,7 +160,7 @@ def measure_point(loop: MeasuredLoop, values: Mapping[str, float]) -> LoopPoint:
 
 
 def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], float], *, geometric: bool) -> MarginSide:
-    """Search one side of a margin: outwards, then by bisection of the first interval at whose end it is not stable.
+    """Search one side of a margin: outwards to the first value that is not stable, then by bisection.
 
     Args:
         at: measures the loop at a value.
@@ -198,16 +199,18 @@ def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], floa
 
 
 def _is_wide(value_at: Callable[[float], float], inner: float, outer: float, *, geometric: bool) -> bool:
-    """Return whether a bracket, in shares of the way, is wider than `WIDTH`."""
+    """Return whether a bracket, in shares of the way, is wider than `BRACKET_WIDTH`."""
     if outer - inner < _NARROWEST:
         return False
-    low = value_at(inner)
-    high = value_at(outer)
-    if value_at(0.5 * (inner + outer)) in (low, high):
+    stable = value_at(inner)
+    not_stable = value_at(outer)
+    middle = value_at(0.5 * (inner + outer))
+    if middle in (stable, not_stable):  # of a quantity in whole steps, there is no value between
         return False
     if geometric:
-        return abs(math.log(high / low)) > WIDTH
-    return abs(high - low) > WIDTH * abs(high - value_at(0.0))
+        return abs(math.log(not_stable / stable)) > BRACKET_WIDTH
+    margin = abs(not_stable - value_at(0.0))
+    return abs(not_stable - stable) > BRACKET_WIDTH * margin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,12 +223,15 @@ class _SideTask:
 
 
 def _search_side(task: _SideTask) -> many.Row:
-    """Return the side of a margin, for a worker."""
+    """Return the side of a margin, in a worker process."""
     assembly = Assembly(task.loop.scenario)
     quantity = VARIED[task.quantity]
     nominal = quantity.nominal(assembly)
     low, high = quantity.ends(nominal)
-    end = high if task.upward else low
+    if task.upward:
+        end = high
+    else:
+        end = low
     value_at = partial(quantity.between, nominal, end, step=quantity.step(assembly))
 
     def at(value: float) -> LoopPoint:
@@ -234,8 +240,8 @@ def _search_side(task: _SideTask) -> many.Row:
     return {"side": find_side(at, value_at, geometric=quantity.geometric)}
 
 
-def _grow(loop: MeasuredLoop) -> many.Row:
-    """Return the growth at the nominal point, for a worker."""
+def _measure_nominal(loop: MeasuredLoop) -> many.Row:
+    """Return the growth at the nominal point, in a worker process."""
     heading, _changes = point(Assembly(loop.scenario), {})
     return {"growth": measure_growth(loop.scenario, heading=heading, size=loop.size)}
 
@@ -249,17 +255,17 @@ class _PointTask:
 
 
 def _measure_map_point(task: _PointTask) -> many.Row:
-    """Return a point of a map, for a worker."""
+    """Return a point of a map, in a worker process."""
     return {"point": measure_point(task.loop, task.values)}
 
 
 def loop_margins(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> LoopMargins:
-    """Return the margins of one loop, without any where it is not stable, measured in this process.
+    """Measure the margins of one loop in this process; there are none where it is not stable.
 
     Raises:
         InputError: the loop cannot be built.
     """
-    growth: Growth = _grow(loop)["growth"]
+    growth: Growth = _measure_nominal(loop)["growth"]
     sides = {}
     if growth.stable:
         for task in _side_tasks(loop, quantities):
@@ -268,7 +274,7 @@ def loop_margins(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> Lo
 
 
 class LoopMeasurement:
-    """Measures loops in worker processes, and tells how far it is."""
+    """Measures loops in worker processes, and reports its progress."""
 
     def __init__(self, loops: Sequence[MeasuredLoop], *, workers: int | None, progress: Progress) -> None:
         self._loops = loops
@@ -295,14 +301,14 @@ class LoopMeasurement:
             InputError: a loop cannot be built.
         """
         growths: list[Growth] = []
-        for loop, row in zip(self._loops, self._rows("nominal", self._loops, _grow), strict=True):
+        for loop, row in zip(self._loops, self._rows("nominal", self._loops, _measure_nominal), strict=True):
             if "growth" not in row:
                 raise InputError(f"{loop.name}: {row['reason']}")
             growths.append(row["growth"])
         return growths
 
     def margins(self, quantities: Sequence[VariedQuantity]) -> list[LoopMargins]:
-        """Return the margins of each loop, without any where it is not stable.
+        """Measure the margins of each loop; there are none where it is not stable.
 
         Raises:
             InputError: a loop cannot be built.
@@ -317,35 +323,19 @@ class LoopMeasurement:
             rows = self._rows("margins", tasks, _search_side)
         measured: list[LoopMargins] = []
         for loop, growth in zip(self._loops, growths, strict=True):
-            sides = {}
-            failures = []
-            for task, row in zip(tasks, rows, strict=True):
-                if task.loop is not loop:
-                    continue
-                if "side" in row:
-                    sides[task.quantity, task.upward] = row["side"]
-                else:
-                    failures.append(f"{task.quantity}: {row['reason']}")
-            measured.append(
-                LoopMargins(
-                    name=loop.name,
-                    size=loop.size,
-                    growth=growth,
-                    margins=_margins(loop, quantities, sides),
-                    failures=tuple(failures),
-                )
-            )
+            of_loop = [(task, row) for task, row in zip(tasks, rows, strict=True) if task.loop is loop]
+            measured.append(_loop_margins_of(loop, growth, quantities, of_loop))
         return measured
 
     def map(self, loop: MeasuredLoop, measured: LoopMargins, pair: tuple[str, str]) -> StabilityMap:
-        """Return the map of a stable loop over two quantities, somewhat beyond the margins of either."""
-        across, up = pair
-        x_values = _map_values(measured.margins[across])
-        y_values = _map_values(measured.margins[up])
+        """Return the map of a stable loop over two quantities, to somewhat beyond the margins of both."""
+        x_name, y_name = pair
+        x_values = _map_values(measured.margins[x_name])
+        y_values = _map_values(measured.margins[y_name])
         tasks = []
         for y in y_values:
             for x in x_values:
-                tasks.append(_PointTask(loop=loop, values={across: x, up: y}))
+                tasks.append(_PointTask(loop=loop, values={x_name: x, y_name: y}))
         points: list[LoopPoint] = []
         for task, row in zip(tasks, self._rows("map", tasks, _measure_map_point), strict=True):
             if "point" in row:
@@ -367,6 +357,29 @@ def _side_tasks(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> Ite
             yield _SideTask(loop=loop, quantity=quantity.name, upward=False)
         if high > nominal:
             yield _SideTask(loop=loop, quantity=quantity.name, upward=True)
+
+
+def _loop_margins_of(
+    loop: MeasuredLoop,
+    growth: Growth,
+    quantities: Sequence[VariedQuantity],
+    searches: Sequence[tuple[_SideTask, many.Row]],
+) -> LoopMargins:
+    """Return the margins of a loop from its searches; one that failed is listed with its reason."""
+    sides = {}
+    failures = []
+    for task, row in searches:
+        if "side" in row:
+            sides[task.quantity, task.upward] = row["side"]
+        else:
+            failures.append(f"{task.quantity}: {row['reason']}")
+    return LoopMargins(
+        name=loop.name,
+        size=loop.size,
+        growth=growth,
+        margins=_margins(loop, quantities, sides),
+        failures=tuple(failures),
+    )
 
 
 def _margins(

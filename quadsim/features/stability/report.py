@@ -14,8 +14,8 @@ import numpy as np
 
 from quadsim.console.results import Shown, Tabular
 from quadsim.features.stability.margins import (
+    BRACKET_WIDTH,
     MAP_POINTS,
-    WIDTH,
     LoopMargins,
     LoopPoint,
     MarginSide,
@@ -92,7 +92,8 @@ class Stability(Tabular):
 
     def _note(self, loops: Sequence[LoopMargins]) -> str:
         note = (
-            f"Stable up to these values, to {100.0 * WIDTH:g} %; < and >: up to the end of the range that is searched."
+            f"Stable up to these values, to {100.0 * BRACKET_WIDTH:g} %; "
+            "< and >: up to the end of the range that is searched."
         )
         for loop in loops:
             for margin in loop.margins.values():

@@ -44,7 +44,7 @@ class Caption(NamedTuple):
     colour: str
 
 
-class Overlay:
+class CaptionPainter:
     """Draws the captions of one film onto its frames.
 
     Lengths below are design pixels of a 1280 x 720 frame, scaled to the frame's real size.

@@ -22,7 +22,7 @@ from quadsim.controller import Phase
 from quadsim.palette import COLOUR, rgba
 from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.report.film.camera import REQUEST
-from quadsim.report.film.captions import Overlay
+from quadsim.report.film.captions import CaptionPainter
 from quadsim.report.film.frames import Filmed, Footage, Shot, make_footage, thin
 from quadsim.report.film.painter import Picture
 from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model, obstacle_body
@@ -198,7 +198,7 @@ def frames(run: Filmed, shot: Shot) -> Iterator[Picture]:
     footage = make_footage(run, shot.times)
     overlay = None
     if shot.captions:
-        overlay = Overlay(run, footage, width=shot.width, height=shot.height, speed=shot.speed)
+        overlay = CaptionPainter(run, footage, width=shot.width, height=shot.height, speed=shot.speed)
     with FilmStage(run, footage, width=shot.width, height=shot.height) as stage:
         for i in range(shot.count):
             picture = stage.render(i)

@@ -51,7 +51,7 @@ from quadsim.ties import TIE_SHARE, first_smallest
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
 LARGEST_NUMBER: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
-MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
+MOST_COURSE_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED_DECIMALS: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
 TableFactor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
@@ -240,8 +240,8 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
         fewest_rows = 1
     if len(rows) < fewest_rows + 1:
         raise FileError(path, f"must have {fewest_rows} or more rows below its header; got {len(rows) - 1}")
-    if len(rows) > MOST_ROWS + 1:
-        raise FileError(path, f"must have {MOST_ROWS} or fewer rows below its header")
+    if len(rows) > MOST_COURSE_ROWS + 1:
+        raise FileError(path, f"must have {MOST_COURSE_ROWS} or fewer rows below its header")
     numbers = np.array([_parse_row(path, number, row, header) for number, row in enumerate(rows[1:], start=2)])
     digest = hashlib.sha256(content).hexdigest()
     if kind is POLYNOMIALS:
@@ -253,7 +253,7 @@ def _read_cells(path: FilePath, content: bytes) -> list[list[str]]:
     """Return the cells of a file, row by row, without empty rows at its end and an empty last column."""
     try:
         lines = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-        rows = list(islice(lines, MOST_ROWS + 2))
+        rows = list(islice(lines, MOST_COURSE_ROWS + 2))
     except (ValueError, csv.Error) as error:
         raise FileError(path, f"cannot be read ({error})") from error
     while rows and not rows[-1]:

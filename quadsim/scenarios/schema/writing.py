@@ -19,7 +19,7 @@ from pydantic_core import PydanticUndefined
 
 from quadsim.scenarios.schema.base import fields_of, is_table
 
-WIDTH: Final = 120
+LINE_WIDTH: Final = 120
 """Longest line with a comment; a comment that does not fit beside its field is written above it."""
 _LONG: Final = 76  # a list that is longer takes a line per entry
 
@@ -319,10 +319,10 @@ def _commented(text: str, comment: str) -> list[str]:
     line = text
     if comment:
         line = f"{text}  # {comment}"
-    if len(line) <= WIDTH and "\n" not in text:
+    if len(line) <= LINE_WIDTH and "\n" not in text:
         return [line]
     return [*_wrapped(comment), text]
 
 
 def _wrapped(comment: str, **options: Any) -> list[str]:
-    return [f"# {line}" for line in textwrap.wrap(comment, WIDTH - 2, **options)]
+    return [f"# {line}" for line in textwrap.wrap(comment, LINE_WIDTH - 2, **options)]

@@ -210,8 +210,8 @@ def test_the_answer_says_who_tracks_closer_and_a_plot_shows_by_how_much(thousand
                 verdict = "closer"
             elif difference.lower is not None and difference.lower > 0.0:
                 verdict = "farther"
-            (told,) = [part for part in result.tracking.split(";") if f"{verdict} in" in part]
-            assert f" {metric.name[-1]}" in told
+            (sentence,) = [part for part in result.tracking.split(";") if f"{verdict} in" in part]
+            assert f" {metric.name[-1]}" in sentence
     drawn = [events_figure(result), result.small_plot()]
     (events,), (metrics,) = [figure.panels for figure in drawn if figure is not None]
     assert "failure" in events.x_names

@@ -197,7 +197,7 @@ def test_a_vehicle_whose_autopilot_has_no_lag_is_reported_and_flies(
     assert main(["vehicle", str(file)]) == EXIT_DONE
     printed = " ".join(capsys.readouterr().out.split())
     assert why[:40] in printed
-    with pytest.raises(InputError, match=f"a step of {axis} is not reached"):  # who needs it is told
+    with pytest.raises(InputError, match=f"a step of {axis} is not reached"):
         _ = Assembly(load_scenario("hover").replace({"vehicle.file": str(file)})).inner_lag
 
 

@@ -1,4 +1,4 @@
-"""Environments: the field's conventions, honest constraint information, and the bytes of `quadsim run`."""
+"""Environments: the field's conventions, correct constraint information, and the bytes of `quadsim run`."""
 
 from __future__ import annotations
 

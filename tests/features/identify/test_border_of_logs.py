@@ -46,7 +46,7 @@ def table(path: Path, rows: Array) -> Path:
     return path
 
 
-def spoilt(path: Path, eight: Array, column: str, value: float, row: int | slice = 350) -> Path:
+def corrupted(path: Path, eight: Array, column: str, value: float, row: int | slice = 350) -> Path:
     rows = eight.copy()
     rows[row, NAMES.index(column)] = value
     return table(path, rows)
@@ -69,7 +69,7 @@ def spoilt(path: Path, eight: Array, column: str, value: float, row: int | slice
 def test_a_sample_that_no_vehicle_has_is_named(
     tmp_path: Path, eight: Array, column: str, value: float, largest: str
 ) -> None:
-    path = spoilt(tmp_path / "one.csv", eight, column, value)
+    path = corrupted(tmp_path / "one.csv", eight, column, value)
     with pytest.raises(InputError) as error:
         read_record(path)
     assert str(error.value) == (
@@ -82,7 +82,7 @@ def test_a_time_that_is_none_is_refused(tmp_path: Path, eight: Array, value: flo
     """In the middle of a log, or at its end, where a jump would make a clock of any length."""
     for row in (350, -1):
         with pytest.raises(InputError, match=r"goes back|time jumps from 6\.98 to|each with a finite time"):
-            read_record(spoilt(tmp_path / "time.csv", eight, "t", value, row))
+            read_record(corrupted(tmp_path / "time.csv", eight, "t", value, row))
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, 1.0, 1e3, 1e-310])
@@ -93,7 +93,7 @@ def test_a_column_that_stands_still_is_read_and_checked_or_refused(
     """Nothing else is raised, not even a warning."""
     start = load_vehicle(vehicle_path("hummingbird"))
     with contextlib.suppress(InputError):
-        airborne_spans(read_record(spoilt(tmp_path / "still.csv", eight, column, value, slice(None))), start)
+        airborne_spans(read_record(corrupted(tmp_path / "still.csv", eight, column, value, slice(None))), start)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 60])
@@ -105,7 +105,7 @@ def test_a_log_of_few_rows_is_refused(tmp_path: Path, eight: Array, count: int) 
 
 def test_a_log_that_admits_no_fit_says_so(tmp_path: Path, eight: Array) -> None:
     """A rate that is 0 throughout says nothing of an inertia: its normal equations are singular."""
-    path = spoilt(tmp_path / "flat.csv", eight, "wy", 0.0, slice(None))
+    path = corrupted(tmp_path / "flat.csv", eight, "wy", 0.0, slice(None))
     with pytest.raises(InputError, match=r"flat\.csv"):
         identify_logs([path], vehicle_path("hummingbird"))
 

@@ -324,7 +324,7 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
     assert (here / "mine.toml").exists()
 
 
-def test_the_verdict_comes_first_with_the_errors_over_those_of_each_rival(identified: IdentifiedVehicle) -> None:
+def test_the_verdict_comes_first_with_the_errors_over_those_of_each_baseline(identified: IdentifiedVehicle) -> None:
     errors = {
         name: np.full((len(HORIZONS), 4), of)
         for name, of in (("identified", 1.0), ("start", 4.0), ("rates held", 2.0), ("rates decay", 5.0), ("floor", 0.9))

@@ -223,7 +223,7 @@ def test_the_gate_judges_the_final_interval() -> None:
     moved.adopt(search)
     moved.x[[number.name for number in search.free].index("inertia_x")] += 0.4
     held = judgement.refuse_moved(moved)
-    assert "inertia_x" not in held  # the log speaks against the start's
+    assert "inertia_x" not in held  # the log contradicts the start
     refused = judgement.estimates["inertia_x"]
     assert refused.refused.startswith("not excited: the interval is +-")
     assert refused.advice
@@ -263,7 +263,7 @@ def test_throttle_alone_shows_thrust_only_for_the_highest_speed_as_kept() -> Non
 
 
 def test_a_lag_that_nothing_shows_takes_the_inertia_with_it() -> None:
-    """A hover of which 4 s are logged: without the rotors' speeds they cannot be told apart."""
+    """A hover of which 4 s are logged: without the rotors' speeds they cannot be distinguished."""
     record = record_of(flown(course="hover"))
     found = identify_records([record], [[slice(0, 420)]], START, wind=True)
     known = by_name(found)
@@ -323,9 +323,9 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     errors = predict([read], [[slice(100, 900)]], found, START).errors["identified"]
     assert np.isnan(errors[:, :2]).all()
     assert np.isfinite(errors[:, 2:]).all()
-    for spoilt, why in ((force / 9.81, "likely in g"), (-force, "likely z points down")):
+    for corrupted, why in ((force / 9.81, "likely in g"), (-force, "likely z points down")):
         with pytest.raises(InputError, match=why):
-            to_record("imu", series | {"specific_force": Column(t=record.t, values=spoilt)})
+            to_record("imu", series | {"specific_force": Column(t=record.t, values=corrupted)})
 
 
 def test_two_logs_are_fitted_together_and_narrow_the_intervals() -> None:

@@ -1,4 +1,4 @@
-"""Flight logs, read and checked: each spoilt log is refused or reported by name, and good ones pass in silence."""
+"""Flight logs, read and checked: each corrupted log is refused or reported by name, and good ones pass in silence."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FIELDS = {
 }
 """Of a record, with the names of their columns."""
 NOISE = {"position": 0.002, "velocity": 0.02, "attitude": 0.26, "rates": 0.43}
-Spoil = Callable[[Record], Record]
+Corruption = Callable[[Record], Record]
 Topics = dict[str, tuple[str, Array, Array]]
 
 
@@ -284,16 +284,16 @@ def test_quaternions_must_be_of_length_one(tmp_path: Path, eight: Record) -> Non
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "rule"),
+    ("corrupted", "rule"),
     [
         (lambda table: {f"throttle{i}": 1000.0 + table[f"u{i}"] for i in range(1, 5)}, "throttle1..4 must be shares"),
         (lambda table: {"w1": -table["u1"], **{f"w{i}": table[f"u{i}"] for i in (2, 3, 4)}}, "must be 0 or above"),
         (lambda table: {"roll": 40.0 * table["qx"], "pitch": table["qy"], "yaw": table["qz"]}, "must be in rad; got"),
     ],
 )
-def test_units_that_cannot_be_meant(tmp_path: Path, eight: Record, spoilt: Any, rule: str) -> None:
+def test_units_that_cannot_be_meant(tmp_path: Path, eight: Record, corrupted: Any, rule: str) -> None:
     table = columns(eight)
-    others = spoilt(table)
+    others = corrupted(table)
     without = "qw" if "roll" in others else "u1"
     with pytest.raises(InputError, match=rule):
         read_record(write_csv(tmp_path / "l.csv", {**table, **others}, without=without))
@@ -302,22 +302,22 @@ def test_units_that_cannot_be_meant(tmp_path: Path, eight: Record, spoilt: Any, 
 # Checks
 
 
-def negated(field: str, *axes: int) -> Spoil:
+def negated(field: str, *axes: int) -> Corruption:
     signs = np.array([-1.0 if axis in axes else 1.0 for axis in range(3)])
     return lambda record: replace(record, **{field: getattr(record, field) * signs})
 
 
-def commanded(change: Callable[[Array], Array]) -> Spoil:
+def commanded(change: Callable[[Array], Array]) -> Corruption:
     """Other commands."""
 
-    def spoil(record: Record) -> Record:
+    def corrupt(record: Record) -> Record:
         assert record.commands is not None
         return replace(record, commands=change(record.commands))
 
-    return spoil
+    return corrupt
 
 
-def reordered(*order: int) -> Spoil:
+def reordered(*order: int) -> Corruption:
     return commanded(lambda commands: commands[:, list(order)])
 
 
@@ -332,17 +332,17 @@ def turned_world(record: Record) -> Record:
     return replace(record, **moved)
 
 
-def scaled(**factors: Any) -> Spoil:
+def scaled(**factors: Any) -> Corruption:
     """Fields times factors."""
 
-    def spoil(record: Record) -> Record:
+    def corrupt(record: Record) -> Record:
         return replace(record, **{name: factor * getattr(record, name) for name, factor in factors.items()})
 
-    return spoil
+    return corrupt
 
 
-def without_position(spoil: Spoil) -> Spoil:
-    return lambda record: replace(spoil(record), position=None)
+def without_position(corrupt: Corruption) -> Corruption:
+    return lambda record: replace(corrupt(record), position=None)
 
 
 def swapped_rates(record: Record) -> Record:
@@ -391,7 +391,7 @@ def held_by_a_radio(record: Record, times: int) -> Record:
     return replace(record, **rows)
 
 
-SPOILT: dict[str, Spoil] = {
+CORRUPTED: dict[str, Corruption] = {
     "wx is negated": negated("rates", 0),
     "wy is negated": negated("rates", 1),
     "wz is negated": negated("rates", 2),
@@ -436,10 +436,10 @@ SPOILT: dict[str, Spoil] = {
 """What the refusal of a log says, and what was done to the log."""
 
 
-@pytest.mark.parametrize("name", SPOILT)
-def test_spoilt_logs_are_refused_by_name(eight: Record, hummingbird: Vehicle, name: str) -> None:
+@pytest.mark.parametrize("name", CORRUPTED)
+def test_corrupted_logs_are_refused_by_name(eight: Record, hummingbird: Vehicle, name: str) -> None:
     with pytest.raises(InputError, match=name) as error:
-        notes(SPOILT[name](eight), hummingbird)
+        notes(CORRUPTED[name](eight), hummingbird)
     assert str(error.value).startswith(f"{eight.name}: ")
 
 

@@ -84,7 +84,7 @@ STRUCT = {"Q": "Q", "I": "I", "B": "B", "f": "f", "h": "h", "H": "H", "c": "h", 
 
 
 def dataflash(path: Path, messages: list[Message], parameters: dict[str, float], clock: str = "TimeUS") -> Path:
-    """Write a `.bin`: FMT of every message, the FMTU that tells instances, PARM, and the rows in order of time."""
+    """Write a `.bin`: FMT of every message, the FMTU that names instances, PARM, and the rows in order of time."""
     stamp, ticks = {"TimeUS": ("Q", 1e6), "TimeMS": ("I", 1e3)}[clock]
     formats = {"PARM": ("QNff", "TimeUS,Name,Value,Default"), "FMTU": ("QBNN", "TimeUS,FmtType,UnitIds,MultIds")}
     for message in messages:
@@ -609,8 +609,8 @@ def test_crazyflie(tmp_path: Path, eight: Record, version: int, angles: bool) ->
 def test_crazyflie_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
     path = micro_sd(tmp_path / "log00", crazyflie(eight, angles=False), 2)
     whole = path.read_bytes()
-    for spoilt in (whole[:5] + b"\xff" + whole[6:], whole[:200], whole[:20]):
-        path.write_bytes(spoilt)
+    for corrupted in (whole[:5] + b"\xff" + whole[6:], whole[:200], whole[:20]):
+        path.write_bytes(corrupted)
         with pytest.raises(FileError, match="Crazyflie"):
             read_record(path)
     path.write_bytes(whole[: len(whole) // 2])

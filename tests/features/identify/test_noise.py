@@ -92,13 +92,13 @@ def test_a_forecast_knows_nothing_of_what_comes_after_it() -> None:
 
 
 @pytest.mark.parametrize("noise", NOISES)
-def test_surprises_have_the_spread_of_what_a_forecast_misses(noise: AxisNoise) -> None:
+def test_random_forecast_errors_have_the_spread_of_what_a_forecast_misses(noise: AxisNoise) -> None:
     misfit = drawn(noise, 20_000, 2)
     starts = np.arange(500, 19_900, 50)
     missed = misfit[starts[:, None] + np.arange(25)] - noise.forecast(misfit, PERIOD, starts, 25)
-    surprises = noise.surprises(np.random.default_rng(3).standard_normal((4000, 25)), PERIOD)
+    errors = noise.forecast_errors(np.random.default_rng(3).standard_normal((4000, 25)), PERIOD)
     for horizon in (1, 10, 25):
-        spread = [of[:, :horizon].sum(axis=1).std() for of in (missed, surprises)]
+        spread = [of[:, :horizon].sum(axis=1).std() for of in (missed, errors)]
         assert spread[0] == pytest.approx(spread[1], rel=0.15)
 
 

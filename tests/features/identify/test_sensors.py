@@ -81,17 +81,17 @@ def test_a_sample_that_jumps_is_cut_and_named(
     eight: Record, field: str, column: int, value: float, sensor: str
 ) -> None:
     """By its sensor and time; nothing else of the log changes, and all of it still flies."""
-    spoilt = read(eight, **{field: put(eight, field, 500, column, value)})
-    (note,) = spoilt.notes
+    corrupted = read(eight, **{field: put(eight, field, 500, column, value)})
+    (note,) = corrupted.notes
     assert note.startswith(f"log: {sensor}")
     assert f"at t = {eight.t[500]:.6g} s" in note
-    assert airborne_spans(spoilt, VEHICLE) == airborne_spans(read(eight), VEHICLE)
+    assert airborne_spans(corrupted, VEHICLE) == airborne_spans(read(eight), VEHICLE)
     kept = np.arange(len(eight.t)) != 500
-    np.testing.assert_array_equal(getattr(spoilt, field)[kept], getattr(read(eight), field)[kept])
+    np.testing.assert_array_equal(getattr(corrupted, field)[kept], getattr(read(eight), field)[kept])
     before, after = getattr(eight, field)[[499, 501]]
     tolerance = 1e-3 * np.abs(after).max()
-    assert (getattr(spoilt, field)[500] >= np.minimum(before, after) - tolerance).all()
-    assert (getattr(spoilt, field)[500] <= np.maximum(before, after) + tolerance).all()
+    assert (getattr(corrupted, field)[500] >= np.minimum(before, after) - tolerance).all()
+    assert (getattr(corrupted, field)[500] <= np.maximum(before, after) + tolerance).all()
 
 
 def test_an_attitude_that_turns_away_and_back_is_cut(eight: Record) -> None:
@@ -119,11 +119,11 @@ def test_a_sensor_that_jumps_all_the_time_is_refused(eight: Record) -> None:
 
 
 def test_a_counter_that_stops_briefly_is_cut(eight: Record) -> None:
-    spoilt = read(eight, speeds=put(eight, "speeds", slice(500, 504), 1, 0.0))
-    (note,) = spoilt.notes
+    corrupted = read(eight, speeds=put(eight, "speeds", slice(500, 504), 1, 0.0))
+    (note,) = corrupted.notes
     assert re.match(r"log: the measured speed of rotor 2 stays at 0 rad/s from t = 5 s on while the others", note)
-    assert spoilt.speeds is not None
-    assert spoilt.speeds[500:504].min() > 100.0
+    assert corrupted.speeds is not None
+    assert corrupted.speeds[500:504].min() > 100.0
 
 
 @pytest.mark.parametrize("value", [0.0, 430.0])

@@ -35,7 +35,7 @@ from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
 from quadsim.errors import InputError
 from quadsim.features.live import serving
-from quadsim.features.live.guard import Guard
+from quadsim.features.live.guard import RequestGuard
 from quadsim.features.live.incoming import offers
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.page import Page
@@ -70,7 +70,7 @@ PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
     ],
 )
 def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> None:
-    guard = Guard("127.0.0.1")
+    guard = RequestGuard("127.0.0.1")
     filled = {name: value.replace("{token}", guard.token) for name, value in headers.items()}
     path = "/" + query.replace("{token}", guard.token)
     refused = guard.refusal(filled, path, 8080) is not None
@@ -95,7 +95,7 @@ def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> Non
     ],
 )
 def test_cookies_of_other_programs_on_this_host_lock_nobody_out(others: str) -> None:
-    guard = Guard("127.0.0.1")
+    guard = RequestGuard("127.0.0.1")
     ours = f"quadsim-8080={guard.token}"
 
     def refusal(*cookies: str, hosts: tuple[str, ...] = ("127.0.0.1:8080",)) -> str | None:

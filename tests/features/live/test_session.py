@@ -21,9 +21,9 @@ from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.errors import InputError
 from quadsim.features.live.commands import live
 from quadsim.features.live.inputs import read_script
-from quadsim.features.live.knobs import knobs
 from quadsim.features.live.pace import LATE, Pace
 from quadsim.features.live.session import STRONGEST, Frame, Session, looping
+from quadsim.features.live.tunable_fields import tunable_fields
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
@@ -212,8 +212,8 @@ def test_a_lost_flight_ends_the_session_with_its_reason(session: Session) -> Non
     assert same_bits(session)
 
 
-def test_knobs_have_units_and_limits() -> None:
-    result = {knob.path: knob for knob in knobs(load_scenario("robust").controller)}
+def test_tunable_fields_have_units_and_limits() -> None:
+    result = {field.path: field for field in tunable_fields(load_scenario("robust").controller)}
     assert result["horizon"].minimum == 1
     assert result["output_bounds.roll"].value == (-5.0, 5.0)
     assert "[m/s]" in result["offset_free.velocity_noise"].about

@@ -15,7 +15,14 @@ from support import draw_nothing, fly_here
 import quadsim
 from quadsim.commands.cli import main
 from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
-from quadsim.features.stability.margins import WIDTH, LoopPoint, MarginSide, MeasuredLoop, find_side, measure_point
+from quadsim.features.stability.margins import (
+    BRACKET_WIDTH,
+    LoopPoint,
+    MarginSide,
+    MeasuredLoop,
+    find_side,
+    measure_point,
+)
 from quadsim.features.stability.quantities import VARIED, point
 from quadsim.rollout.growth import SIZE
 from quadsim.scenarios.assembly import Assembly
@@ -53,7 +60,7 @@ def test_the_bracket_holds_the_margin_to_its_width(margin: float) -> None:
     side = side_of(lambda value: value < margin)
     assert side.unstable is not None
     assert side.stable < margin <= side.unstable
-    assert side.unstable - side.stable <= WIDTH * side.unstable
+    assert side.unstable - side.stable <= BRACKET_WIDTH * side.unstable
 
 
 @pytest.mark.parametrize("margin", [1.05, 1.9, 7.0])
@@ -61,7 +68,7 @@ def test_the_bracket_of_a_factor_is_a_share_of_its_value(margin: float) -> None:
     side = side_of(lambda value: value < margin, end=8.0, geometric=True)
     assert side.unstable is not None
     assert side.stable < margin <= side.unstable
-    assert side.unstable / side.stable <= math.exp(WIDTH)
+    assert side.unstable / side.stable <= math.exp(BRACKET_WIDTH)
 
 
 def test_what_is_stable_again_beyond_an_unstable_value_is_not_taken_for_stable() -> None:

@@ -16,7 +16,7 @@ from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnav
 from quadsim.flight.audit import Limit, audit
 from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
-from quadsim.report.film.captions import Overlay, margin_rows
+from quadsim.report.film.captions import CaptionPainter, margin_rows
 from quadsim.report.film.frames import filmed, make_footage, ranked_tracks
 from quadsim.report.film.video import (
     Estimate,
@@ -223,7 +223,7 @@ def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_wen
     def headlines(sentence: str, advice: str) -> list[list[str]]:
         result = {"sentence": sentence, "advice": advice}
         run = filmed(recording(short_run, controller=controller, diagnosis=result))
-        overlay = Overlay(run, footage, width=1280, height=720)
+        overlay = CaptionPainter(run, footage, width=1280, height=720)
         return [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
 
     before, first, last = headlines(long, "to try: more")
@@ -245,7 +245,7 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
     def red(*limits: Limit) -> int:
         """How many pixels of the last frame the captions paint red."""
         run = filmed(judged_by(short_run, *limits))
-        overlay = Overlay(run, make_footage(run, np.array([6.0])), width=1280, height=720)
+        overlay = CaptionPainter(run, make_footage(run, np.array([6.0])), width=1280, height=720)
         picture = overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 0)
         return int(np.count_nonzero((picture == rgb(ON_DARK.violated)).all(axis=-1)))
 

@@ -10,9 +10,9 @@ from quadsim.scenarios.schema.base import fields_of, is_table
 from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.scenarios.schema.problems import Kind, kinds_of
 
-KnobValue = float | int | bool | str | tuple[float, ...]
+FieldValue = float | int | bool | str | tuple[float, ...]
 
-TURNED_FIELDS: Final = {
+MAIN_FIELDS: Final = {
     "Tracking weights": {
         "output_weights.x": "x [1/m²]",
         "output_weights.y": "y [1/m²]",
@@ -38,28 +38,28 @@ TURNED_FIELDS: Final = {
     "Robustness": {"soft.linear": "slack weight", "rotor_lag": "rotor lag [s]"},
     "Solver": {"horizon": "N [periods]", "iterations": "iterations"},
 }
-"""The fields that people turn, with their labels, by group; the rest are in "All fields"."""
+"""The fields that people change most, with their labels, by group; the rest are in "All fields"."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Knob:
+class TunableField:
     """A field with its value."""
 
     path: str  # dotted, in `[controller]`
-    value: KnobValue  # as it is
+    value: FieldValue  # as it is
     about: str  # unit and meaning
     minimum: float | None = None  # of a number, or each of a pair; None for none
     maximum: float | None = None  # likewise
     choices: tuple[str, ...] = ()  # of a text
 
 
-def knobs(spec: AnyController) -> tuple[Knob, ...]:
+def tunable_fields(spec: AnyController) -> tuple[TunableField, ...]:
     """Return the fields of a controller, except its type, long lists and settings of user-defined controllers."""
     fields = _fields("", spec, (Kind(type=type(spec)),), "")
-    return tuple(knob for knob in fields if knob.path != "type")
+    return tuple(field for field in fields if field.path != "type")
 
 
-def _fields(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
+def _fields(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[TunableField]:
     """Yield the fields of a value at a path, which is of one of some kinds; `about` is what the path is about."""
     if is_table(type(value)):
         for name, field in fields_of(type(value)).items():
@@ -71,7 +71,7 @@ def _fields(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterato
     elif isinstance(value, str):
         choices = [str(choice) for kind in kinds for choice in kind.choices]
         if len(choices) > 1:  # else there is nothing to choose
-            yield Knob(path=path, value=value, about=about, choices=tuple(choices))
+            yield TunableField(path=path, value=value, about=about, choices=tuple(choices))
     elif isinstance(value, int | float):
         yield from _number(path, value, kinds, about)
     elif isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(n, int | float) for n in value):
@@ -93,12 +93,12 @@ def _kinds_of_entries(kinds: Sequence[Kind]) -> list[Kind]:
     return entries
 
 
-def _number(path: str, value: KnobValue, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
+def _number(path: str, value: FieldValue, kinds: Sequence[Kind], about: str) -> Iterator[TunableField]:
     """Yield a field of a number or a pair, with its limits; nothing if its declaration is of no number."""
     for kind in kinds:
         if kind.type in (float, int, bool):
             low = kind.limits.get("ge", kind.limits.get("gt"))
             high = kind.limits.get("le", kind.limits.get("lt"))
-            yield Knob(path=path, value=value, about=about, minimum=low, maximum=high)
+            yield TunableField(path=path, value=value, about=about, minimum=low, maximum=high)
             return
     # else it is what a user's controller reads
