@@ -313,7 +313,7 @@ def try_values(
     """
     allows = Draft202012Validator({**schema, "$defs": kind.schema["$defs"]}).is_valid
     declaration = str({key: value for key, value in schema.items() if key not in WORDS})
-    junk_values = JUNK
+    junk_values: Sequence[Any] = JUNK
     if declaration in tally.declarations:
         junk_values = JUNK[:1]
     tally.declarations.add(declaration)

@@ -331,7 +331,7 @@ def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) 
 
 
 def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(small: pa.Table) -> None:
-    columns = {
+    columns: dict[str, list[Any]] = {
         "verdict": ["incomplete"] * 8,
         "failed": [False] * 8,
         "violated": [False] * 8,
@@ -350,7 +350,7 @@ def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(smal
 @pytest.fixture
 def six(thousand: pa.Table) -> pa.Table:
     """Six flights whose constraints hold, not in the order of their numbers."""
-    columns = {"verdict": ["satisfied"] * 6, "failed": [False] * 6, "flight": [5, 1, 4, 2, 3, 0]}
+    columns: dict[str, list[Any]] = {"verdict": ["satisfied"] * 6, "failed": [False] * 6, "flight": [5, 1, 4, 2, 3, 0]}
     return with_columns(thousand.slice(0, 6), columns)
 
 
