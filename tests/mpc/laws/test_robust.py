@@ -62,7 +62,7 @@ def flown(
     controller.reset(hover)
     x = np.concatenate([state, hover])[: plant.n]  # the rotor speeds are states of a plant with lag alone
     whole_periods, late = divmod(controller.preparation.delay, PERIOD)
-    sent = [hover] * (1 + round(whole_periods))  # commands that do not act yet, but for the first, which acts
+    sent = [hover] * (1 + round(whole_periods))  # the first acts, those after it are under way
     for k in range(periods):
         now = StepInputs(time=k * PERIOD, acting=sent[-1])
         command = controller.step(now, x[:12], reference[k + 1 : k + 1 + controller.horizon])
@@ -167,7 +167,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle, delay: floa
         controller.step(StepInputs(acting=acting, phase=phase), state, HOLD)
         after_a_period, _ = respond(rotors, speeds, acting, np.array([PERIOD]))
         speeds = after_a_period[0]
-        np.testing.assert_allclose(preparation_of(controller)._turning, speeds, atol=1e-9)
+        np.testing.assert_allclose(preparation_of(controller)._turning, speeds, rtol=1e-12)
     assert np.abs(speeds - acting).max() > 0.1, "they would be followed without a lag, too"
 
 
