@@ -311,7 +311,7 @@ def test_any_table_by_a_map(tmp_path: Path, eight: Record) -> None:
         ('unit = "us"\n\n', "\n", r"[0-9.e-]+ samples per second, period"),
     ],
 )
-def test_maps_that_cannot_be_used(tmp_path: Path, eight: Record, old: str, new: str, message: str) -> None:
+def test_maps_that_cannot_be_used_are_refused(tmp_path: Path, eight: Record, old: str, new: str, message: str) -> None:
     assert old in MAP
     path = foreign(tmp_path / "foreign.csv", eight)
     with pytest.raises(InputError, match=message):
@@ -402,28 +402,32 @@ TOPICS = {
 }
 
 
-def write_bag(path: Path, record: Record) -> Path:
-    """Write the file of a bag of ROS 1, or a folder of ROS 2 without the path's suffix; return the one that is there.
+def open_bag(path: Path) -> tuple[Path, Any, Any]:
+    """Open a bag by its suffix: the file of ROS 1, or the folder of ROS 2, which has no suffix.
 
-    The motors' messages have no header: they arrive at the time at which the others are stamped, these 3 ms later.
+    Returns:
+        Its path, its writer, and the types of its messages.
     """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
+    if path.suffix == ".bag":
+        return path, Writer1(path), get_typestore(Stores.ROS1_NOETIC)
+    plugin = {".db3": StoragePlugin.SQLITE3, ".mcap": StoragePlugin.MCAP}[path.suffix]
+    folder = path.with_suffix("")
+    return folder, Writer2(folder, version=9, storage_plugin=plugin), get_typestore(Stores.ROS2_HUMBLE)
+
+
+def write_bag(path: Path, record: Record) -> Path:
+    """Write the bag of `open_bag`; return its path.
+
+    The motors' messages have no header: they arrive at the time at which the others are stamped, these 3 ms later.
+    """
+    bag, writer, store = open_bag(path)
     ros1 = path.suffix == ".bag"
-    if ros1:
-        store = get_typestore(Stores.ROS1_NOETIC)
-        serialize = store.serialize_ros1
-        bag = path
-        writer = Writer1(bag)
-    else:
-        store = get_typestore(Stores.ROS2_HUMBLE)
-        serialize = store.serialize_cdr
-        bag = path.with_suffix("")
-        plugin = {".db3": StoragePlugin.SQLITE3, ".mcap": StoragePlugin.MCAP}[path.suffix]
-        writer = Writer2(bag, version=9, storage_plugin=plugin)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     messages = Messages(store.types, ros1)
     with writer:
         connections = {}
