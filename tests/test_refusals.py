@@ -44,6 +44,7 @@ FILE = "mine.toml"
 WORDS = ("default", "description", "title")
 """The keys of a schema that do not change what it allows."""
 JUNK = ("junk", "", True, math.nan, -math.inf, -1, 0, 1e300, date(2024, 1, 31), [], [[["junk"]]], {}, {"junk": 1})
+"""A value of every type, and numbers that few fields allow; the first is tried in every field."""
 LINES = (
     re.compile(r"(?P<field>\S+) must be .+; got (?P<got>.+)"),
     re.compile(r"(?P<field>\S+) is not a field of the \w+ file.* \(there are: .+\)"),
