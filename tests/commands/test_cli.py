@@ -1,4 +1,4 @@
-"""The command line: what each command prints, its exit status, and one clear message for every wrong input."""
+"""The command line: what each command prints, its exit status, and one message for wrong input."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ from quadsim.scenarios.catalogue import campaign_names, scenario_names, variants
 from quadsim.scenarios.loading import load_scenario
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
+"""Write the tables of a run and none of its products."""
 SHORT = ("--set", "duration=0.5")
+SHORT_FILE = 'base = "hover"\nname = "short"\nduration = 0.2\nconstraints = []\n'
 
 
 @pytest.fixture
@@ -51,6 +53,7 @@ def hover_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def left_in(directory: Path) -> list[str]:
+    """The paths of all files and folders below a directory."""
     return sorted(path.relative_to(directory).as_posix() for path in directory.rglob("*"))
 
 
@@ -67,13 +70,14 @@ def test_list_prints_a_line_for_each_name(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_list_shows_a_variant_below_its_base() -> None:
+    """Names are indented by two spaces, those of variants by four."""
     bases = {}
-    above = ""
+    base = ""
     for indented, name in re.findall(r"^  (  )?([\w.-]+) ", quadsim.catalogue().text(), re.MULTILINE):
         if indented:
-            bases[name] = above
+            bases[name] = base
         else:
-            above = name
+            base = name
     assert bases == {name: row.base for name, row in variants().items()}
 
 
@@ -101,7 +105,8 @@ def test_without_a_command_it_prints_help_and_fails(capsys: pytest.CaptureFixtur
     printed = capsys.readouterr()
     assert printed.err == ""
     for name in app:
-        assert name.startswith("-") or f"│ {name} " in printed.out
+        if not name.startswith("-"):
+            assert f"│ {name} " in printed.out
 
 
 @pytest.mark.parametrize(
@@ -123,25 +128,37 @@ def test_a_shell_completes_names_and_paths(
 # --- scenario ------------------------------------------------------------------------------------------------------
 
 
+HEAVY = ("--set", "vehicle.mass=4.2", "--seed", "7")
+
+
 def test_a_printed_scenario_is_a_scenario_file(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenario", "hover", *SHORT, "--set", "vehicle.mass=4.2", "--seed", "7"]) == EXIT_DONE
+    """It prints itself again, and what is derived is a comment in it."""
+    assert main(["scenario", "hover", *SHORT, *HEAVY]) == EXIT_DONE
     printed = capsys.readouterr()
     assert printed.err == ""
     assert "mass = 4.2" in printed.out
-    assert "inertia = [0.033, 0.033, 0.066]" in printed.out
+    assert "# inertia = [0.033, 0.033, 0.066]  # derived" in printed.out
     assert "# [s] physics step" in printed.out
     (here / "mine.toml").write_text(printed.out)
     assert main(["scenario", "mine.toml"]) == EXIT_DONE
     assert capsys.readouterr().out == printed.out
     assert load_scenario("mine.toml").seed == 7
-    assert main(["run", "mine.toml", *TABLES, "--out", "run"]) == EXIT_DONE
+
+
+def test_the_scenario_of_a_run_states_what_its_vehicle_file_says(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It flies again whatever becomes of that file, and it prints itself."""
+    assert main(["run", "hover", *SHORT, *HEAVY, *TABLES, "--out", "run"]) == EXIT_DONE
     capsys.readouterr()
     of_run = (here / "run" / "scenario.toml").read_text()
-    assert "# inertia = [0.033, 0.033, 0.066]  # derived" in printed.out
     assert "\ninertia = [0.033, 0.033, 0.066]  # of lopes2011" in of_run
     assert "\nmass = 4.2\n" in of_run
     assert main(["scenario", "run/scenario.toml"]) == EXIT_DONE
     assert capsys.readouterr().out == of_run
+
+
+def test_the_schema_of_scenarios_is_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenario", "--schema"]) == EXIT_DONE
     assert json.loads(capsys.readouterr().out)["title"] == "A quadsim scenario"
 
@@ -151,13 +168,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"quadsim {__version__}\n"
 
 
-def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_times_both_integrators_and_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == EXIT_DONE
     result = json.loads(capsys.readouterr().out)
     assert list(result) == ["machine", "packages", "rendering", "viewer", "many vehicles", "solvers"]
     assert [*result["many vehicles"]] == ["own method", "MuJoCo's step"]
     for line in result["many vehicles"].values():
-        assert int(line.split(" steps of 50 ms")[0]) > 100
+        steps_per_second, _, _ = line.partition(" steps of 50 ms")
+        assert int(steps_per_second) > 100
     assert list(result["solvers"]) == list(solver_entries())
     for name, line in result["solvers"].items():
         if solver_entries()[name].installed:
@@ -170,6 +188,7 @@ def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
 def test_without_the_library_doctor_and_a_flight_by_the_core_say_what_compiles_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Past the caches of both functions, which have the library of this process."""
     monkeypatch.setattr(library, "ROOT", tmp_path)
     monkeypatch.setattr(mirror, "load_library", library.load_library.__wrapped__)
     monkeypatch.setattr(solver, "core_library", mirror.core_library.__wrapped__)
@@ -197,29 +216,31 @@ def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: p
 # --- run -----------------------------------------------------------------------------------------------------------
 
 
-def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
+def test_run_prints_the_verdict_before_it_makes_products_and_what_to_open_at_its_end(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before: list[str] = []
-    make = flown.add_products
+    """With --json, it prints the summary alone, when the products are made."""
+    printed_before: list[str] = []
+    add_products = flown.add_products
 
-    def slow(*arguments: Any, **options: Any) -> flown.Flight:
-        before.append(capsys.readouterr().out)
+    def observed(*arguments: Any, **options: Any) -> flown.Flight:
+        printed_before.append(capsys.readouterr().out)
         assert rundir.read_summary(here / "runs" / "hover")["verdict"] == "satisfied"
-        return make(*arguments, **options)
+        return add_products(*arguments, **options)
 
-    monkeypatch.setattr(flown, "add_products", slow)
+    monkeypatch.setattr(flown, "add_products", observed)
     assert main(["run", "hover", *SHORT, "--no-video", "--no-figures"]) == EXIT_DONE
-    assert before[0].startswith("hover ")
-    written, view, plot = capsys.readouterr().out.splitlines()
+    assert printed_before[0].startswith("hover ")
+    written, view_command, plot_command = capsys.readouterr().out.splitlines()
     assert written.endswith("runs/hover")
-    assert view == "quadsim view runs/hover"
-    _, *words = plot.split()
-    assert main(words) == EXIT_DONE, "it can be pasted"
+    assert view_command == "quadsim view runs/hover"
+    program, *arguments = plot_command.split()
+    assert program == "quadsim"
+    assert main(arguments) == EXIT_DONE
     assert (here / "hover.pdf").is_file()
     capsys.readouterr()
     assert main(["run", "hover", *SHORT, "--no-video", "--no-figures", "--json"]) == EXIT_DONE
-    assert before[1] == ""
+    assert printed_before[1] == ""
     assert json.loads(capsys.readouterr().out)["products"] == {"flight.rrd": "made"}
 
 
@@ -279,11 +300,12 @@ LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
 def test_the_outcome_is_compared_with_what_the_scenario_expects(
     here: Path, capsys: pytest.CaptureFixture[str], settings: list[str], expect: str, as_expected: bool
 ) -> None:
-    """What was expected changes no exit status: 0 is for constraints that hold."""
+    """The exit status tells whether the constraints held, whatever was expected."""
     status = EXIT_FAILED if settings else EXIT_DONE
     assert main(["check", "hover", *SHORT, *settings, "--set", f"expect={expect}", "--json"]) == status
     summary = json.loads(capsys.readouterr().out)
-    assert (summary["group"], summary["expected"], summary["as_expected"]) == ("courses", expect, as_expected)
+    assert summary["group"] == "courses"
+    assert (summary["expected"], summary["as_expected"]) == (expect, as_expected)
 
 
 # --- check ---------------------------------------------------------------------------------------------------------
@@ -298,6 +320,7 @@ def test_check_flies_a_scenario_and_writes_nothing(here: Path) -> None:
 def test_check_writes_its_verdicts_as_junit(
     hover_directory: Path, short_run_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """A test for the flight and for each constraint; those whose window the flight ends before are skipped."""
     for directory, tests, skipped in ((hover_directory, 8, 0), (short_run_directory, 9, 4)):
         main(["check", str(directory), "--junit", "verdicts.xml"])
         suite = ElementTree.parse("verdicts.xml").getroot()
@@ -315,10 +338,9 @@ def test_check_writes_its_verdicts_as_junit(
 def test_compare_leaves_out_what_it_is_told_to_and_names_its_columns(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (here / "short.toml").write_text('base = "hover"\nname = "short"\nduration = 0.2\nconstraints = []\n')
-    products = ["--no-video", "--no-recording", "--no-figures"]
-    arguments = ["compare", "short.toml", "short.toml", "--name", "A", "--name", "B", "--out", "page", *products]
-    assert main([*arguments, "--json"]) == EXIT_DONE
+    (here / "short.toml").write_text(SHORT_FILE)
+    named = ["--name", "A", "--name", "B"]
+    assert main(["compare", "short.toml", "short.toml", *named, "--out", "page", *TABLES, "--json"]) == EXIT_DONE
     assert set(json.loads(capsys.readouterr().out)[0]["values"]) == {"A", "B"}
     assert sorted(path.name for path in (here / "page-runs").iterdir()) == ["short", "short-2"]
     kept = {path.name for path in (here / "page-runs" / "short").iterdir()}
@@ -331,41 +353,64 @@ def test_compare_leaves_out_what_it_is_told_to_and_names_its_columns(
 def test_the_page_is_there_before_its_films_which_are_added_to_it(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (here / "short.toml").write_text('base = "hover"\nname = "short"\nduration = 0.2\nconstraints = []\n')
+    """The second film fails: its run says so, and the page has the first one alone."""
+    (here / "short.toml").write_text(SHORT_FILE)
     page = here / "page" / "index.html"
-    seen: list[tuple[str, str]] = []
+    pages: list[str] = []
+    printed: list[str] = []
     rates: list[int | None] = []
 
-    def render(run: Path, path: Path, *, progress: Any, fps: int | None) -> None:
-        seen.append((page.read_text(), capsys.readouterr().out))
+    def render(_: object, path: Path, *, progress: Any, fps: int | None) -> None:
+        pages.append(page.read_text())
+        printed.append(capsys.readouterr().out)
         rates.append(fps)
-        if len(seen) == 2:
+        if len(pages) == 2:
             raise OutputError(path, "the disk is full")
         path.write_bytes(b"film")
 
     monkeypatch.setattr("quadsim.report.film.video.render_video", render)
     monkeypatch.setattr("quadsim.report.film.video.rendering_backend", lambda: "egl")
-    products = ["--no-recording", "--no-figures", "--fps", "12"]
-    assert main(["compare", "short.toml", "short.toml", "--out", "page", *products]) == EXIT_DONE
-    (first, printed), (again, nothing) = seen
-    assert first == again
-    assert "<video" not in first
-    assert "constraint" in printed
-    assert nothing == ""
+    films_alone = ["--no-recording", "--no-figures", "--fps", "12"]
+    assert main(["compare", "short.toml", "short.toml", "--out", "page", *films_alone]) == EXIT_DONE
+    assert len(pages) == 2
+    for page_before in pages:
+        assert page_before == pages[0]
+        assert "<video" not in page_before
+    assert "constraint" in printed[0]
+    assert printed[1] == ""
+    assert rates == [12, 12]
     assert page.read_text().count("<video") == 1
     done = capsys.readouterr()
     assert done.out.splitlines()[-1] == "open page/index.html"
     assert "flight.mp4 failed: " in done.err
-    assert rates == [12, 12]
-    first, second = (rundir.read_summary(here / "page-runs" / name)["products"] for name in ("short", "short-2"))
+    first = rundir.read_summary(here / "page-runs" / "short")["products"]
+    second = rundir.read_summary(here / "page-runs" / "short-2")["products"]
     assert first["flight.mp4"] == "made"
     assert "the disk is full" in second["flight.mp4"]
-    runs = ["compare", "page-runs/short", "page-runs/short-2", "--out", "again"]
-    assert main(runs) == EXIT_DONE
-    assert len(seen) == 2, "nothing is filmed that was not flown, unless asked for"
-    assert main([*runs, "--overwrite", "--video"]) == EXIT_DONE
-    assert len(seen) == 3, "the one without a film"
-    assert (here / "again" / "index.html").read_text().count("<video") == 2
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_stored_runs_are_filmed_for_a_comparison_only_if_asked_for_and_where_they_have_no_film(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("first", "second"):
+        (here / f"{name}.toml").write_text(SHORT_FILE.replace("short", name))
+    filmed: list[str] = []
+
+    def render(flight: Any, path: Path, **_: Any) -> None:
+        filmed.append(flight.name)
+        path.write_bytes(b"film")
+
+    monkeypatch.setattr("quadsim.report.film.video.render_video", render)
+    monkeypatch.setattr("quadsim.report.film.video.rendering_backend", lambda: "egl")
+    assert main(["run", "first.toml", "--out", "first", "--no-recording", "--no-figures"]) == EXIT_DONE
+    assert main(["run", "second.toml", "--out", "second", *TABLES]) == EXIT_DONE
+    assert filmed == ["first"]
+    assert main(["compare", "first", "second", "--out", "page"]) == EXIT_DONE
+    assert filmed == ["first"]
+    assert main(["compare", "first", "second", "--out", "page", "--overwrite", "--video"]) == EXIT_DONE
+    assert filmed == ["first", "second"]
+    assert (here / "page" / "index.html").read_text().count("<video") == 2
 
 
 @pytest.mark.slow("commands")
@@ -394,7 +439,7 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "video of nothing": (["video", "gone"], "gone"),
     "view of a run without one": (["view", "folder"], "flight.rrd"),
 }
-"""Lines that could leave something behind, and what their message names; its words are in `tests/snapshots/`."""
+"""Lines that could leave something behind, and what their message names."""
 
 
 @pytest.mark.parametrize(("arguments", "named"), WRONG.values(), ids=WRONG)
@@ -438,7 +483,10 @@ def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_noth
 def test_a_full_disk_is_status_2_and_leaves_nothing(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - 2**20, 2**20))
+    total = 2**30
+    free = 2**20
+    full = shutil._ntuple_diskusage(total, total - free, free)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
     assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
     assert f"{here.resolve()}/new/run" in capsys.readouterr().err
     assert left_in(here) == []
@@ -448,7 +496,9 @@ def test_a_full_disk_is_status_2_and_leaves_nothing(
 def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
     command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for text in (".".join(["a"] * 40_000) + " = 1", f"inputs = {'[' * 500}{']' * 500}"):
+    nested_tables = ".".join(["a"] * 40_000) + " = 1"
+    nested_lists = "inputs = " + "[" * 500 + "]" * 500
+    for text in (nested_tables, nested_lists):
         (here / "deep.toml").write_text(text)
         tracemalloc.start()
         try:

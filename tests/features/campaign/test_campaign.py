@@ -19,8 +19,7 @@ import pytest
 import tomlkit
 
 from quadsim.errors import InputError, OutputError
-from quadsim.features.campaign import campaign as module
-from quadsim.features.campaign import store as records
+from quadsim.features.campaign import campaign, store
 from quadsim.features.campaign.campaign import CampaignProgress, compare_replay, recorded_flight
 from quadsim.features.campaign.campaign import CampaignResult as Result
 from quadsim.features.campaign.campaign_file import Choice
@@ -50,28 +49,36 @@ CAMPAIGN: dict[str, Any] = {
 
 @dataclass
 class Alone:
-    """Flies in this process: backwards or not, and interrupted after so many flights."""
+    """Flies a campaign in this process.
+
+    Attributes:
+        backwards: whether the last flight is the first that is flown.
+        stops_after: the number of flights after which it is interrupted.
+    """
 
     backwards: bool = False
     stops_after: int | None = None
 
     def fly(self, plan: Plan, flights: Sequence[int]) -> Generator[Row, None, None]:
-        for i, flight in enumerate(flights[::-1] if self.backwards else flights):
-            if i == self.stops_after:
+        if self.backwards:
+            flights = flights[::-1]
+        for count, flight in enumerate(flights):
+            if count == self.stops_after:
                 raise KeyboardInterrupt
             yield plan.fly(flight)
 
 
 def fly_campaign(plan: Plan, directory: Path, by: Alone | int, *, report: bool = False, **options: Any) -> Result:
-    """Flown in this process, or by so many workers."""
+    """Fly a campaign in this process, or by so many workers."""
     if isinstance(by, int):
-        return module.fly_campaign(plan, directory, workers=by, report=report, **options)
+        return campaign.fly_campaign(plan, directory, workers=by, report=report, **options)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Plan, "fly_all", lambda plan, flights, **_: by.fly(plan, [*flights]))
-        return module.fly_campaign(plan, directory, workers=None, report=report, **options)
+        return campaign.fly_campaign(plan, directory, workers=None, report=report, **options)
 
 
 def make_plan(directory: Path, **changes: Any) -> Plan:
+    """The plan of a file in the directory: `CAMPAIGN` with other fields."""
     path = directory / "little.toml"
     path.write_text(tomlkit.dumps({**CAMPAIGN, **changes}), encoding="utf-8")
     return load_plan(str(path))
@@ -98,7 +105,7 @@ def by_two(tmp_path_factory: pytest.TempPathFactory) -> Result:
 
 @pytest.fixture
 def flown(whole: Result, tmp_path: Path) -> Path:
-    """A copy of its directory to continue, or to tamper with."""
+    """A copy of the directory of `whole`, to continue or to tamper with."""
     return Path(shutil.copytree(whole.directory, tmp_path / "c"))
 
 
@@ -137,7 +144,7 @@ def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, whole: Result, tm
     assert (manifest["status"], manifest["flown"]) == ("interrupted", 5)
     seen: list[CampaignProgress] = []
     resumed = fly_campaign(plan, tmp_path / "again", Alone(), resume=True, watch=seen.append)
-    assert [state.flown for state in seen] == list(range(6, 13))
+    assert [progress.flown for progress in seen] == [6, 7, 8, 9, 10, 11, 12]
     assert content(resumed) == content(whole)
     assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
 
@@ -192,24 +199,26 @@ def law(now, state, reference):
 
 def plan_of_kinds(directory: Path, *kinds: str, **changes: Any) -> Plan:
     """A flight for each kind of the controller."""
-    module = f"mine_{abs(hash(directory))}"  # one name is imported from one place, in a process
+    module = f"mine_{abs(hash(directory))}"  # a process imports a module of one name from one directory only
     (directory / f"{module}.py").write_text(CONTROLLER, encoding="utf-8")
-    entry = {"name": "kind", "fields": ["controller.settings.kind"], "distribution": "grid", "values": [*kinds]}
+    varied = {"name": "kind", "fields": ["controller.settings.kind"], "distribution": "grid", "values": [*kinds]}
     controller = {"type": f"{module}:Mine", "settings": {"kind": "calm"}, "folder": "."}
-    flown = {"duration": 0.5, "constraints": [], "controller": controller}
-    return make_plan(directory, **{"vary": [entry], "flights": len(kinds), "set": flown, **changes})
+    settings = {"duration": 0.5, "constraints": [], "controller": controller}
+    fields = {"vary": [varied], "flights": len(kinds), "set": settings}
+    return make_plan(directory, **(fields | changes))
 
 
 def test_a_flight_that_leaves_its_course_counts_as_lost(tmp_path: Path) -> None:
     (tmp_path / "climbing.py").write_text(CLIMBING, encoding="utf-8")
     limits = {"name": "limit", "fields": ["lost.departure"], "distribution": "grid", "values": [90.0, 4.0]}
     controller = {"type": "climbing:law", "horizon": 1, "folder": "."}
-    flown = {"duration": 6.0, "constraints": [], "lost": {"departure": 4.0}, "controller": controller}
-    result = fly_campaign(make_plan(tmp_path, vary=[limits], flights=2, set=flown), tmp_path / "c", Alone())
+    settings = {"duration": 6.0, "constraints": [], "lost": {"departure": 4.0}, "controller": controller}
+    plan = make_plan(tmp_path, vary=[limits], flights=2, set=settings)
+    result = fly_campaign(plan, tmp_path / "c", Alone())
     assert result.table["verdict"].to_pylist() == ["unaudited", "lost"]
-    reasons = result.table["reason"].to_pylist()
-    assert reasons[0] is None
-    assert "beyond lost.departure = 4 m" in reasons[1]
+    none, departed = result.table["reason"].to_pylist()
+    assert none is None
+    assert "beyond lost.departure = 4 m" in departed
     assert result.table["status"].to_pylist() == ["completed", "completed"]
     assert result.summary["events"]["lost"]["count"] == 1
 
@@ -227,43 +236,48 @@ def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> No
     assert "signal 9" in died
     assert "4 s" in hung
     assert "MemoryError" in memory
-    assert [result.summary["events"][name]["count"] for name in ("failure", "died", "lost")] == [4, 1, 0]
+    events = result.summary["events"]
+    assert events["failure"]["count"] == 4
+    assert events["died"]["count"] == 1
+    assert events["lost"]["count"] == 0
     page = (result.directory / "index.html").read_text(encoding="utf-8")
     for reason in (died, hung, memory):
         assert reason in page
 
 
 def test_flights_of_a_users_controller_do_not_change_each_other(tmp_path: Path) -> None:
-    """A list of the class grows with every step: in one process, the second flight would be another one."""
+    """A list of the class grows with every step: a second flight in the same process would differ."""
     plan = plan_of_kinds(tmp_path, "warms", vary=CAMPAIGN["vary"], flights=6)
     by_one = fly_campaign(plan, tmp_path / "by-1", 1)
     by_two = fly_campaign(plan, tmp_path / "by-2", 2)
     assert content(by_one) == content(by_two)
-    first = plan_of_kinds(tmp_path, "warms", vary=CAMPAIGN["vary"], flights=1)
-    alone = fly_campaign(first, tmp_path / "a", 1)
-    assert by_one.table["rmse.z"][0] == alone.table["rmse.z"][0]
+    first_only = plan_of_kinds(tmp_path, "warms", vary=CAMPAIGN["vary"], flights=1)
+    first = fly_campaign(first_only, tmp_path / "a", 1)
+    assert by_one.table["rmse.z"][0] == first.table["rmse.z"][0]
 
 
-def test_code_of_the_user_is_known_wherever_a_campaign_names_it(tmp_path: Path) -> None:
-    assert not make_plan(tmp_path).flies_user_code
+def test_code_of_the_user_is_known_in_the_scenario_and_in_what_is_varied(tmp_path: Path) -> None:
     assert plan_of_kinds(tmp_path, "calm").flies_user_code
-    drawn = Choice(name="law", fields=["controller"], distribution="choice", values=["mine:Mine"])
     plan = make_plan(tmp_path)
-    assert replace(plan, spec=replace(plan.spec, vary=[drawn])).flies_user_code
+    assert not plan.flies_user_code
+    drawn = Choice(name="law", fields=["controller"], distribution="choice", values=["mine:Mine"])
+    drawing = replace(plan, spec=replace(plan.spec, vary=[drawn]))
+    assert drawing.flies_user_code
 
 
 def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    """Three times by SIGKILL, each time as soon as it has stored a part more."""
     plan = plan_of_kinds(tmp_path, "sleeps", vary=CAMPAIGN["vary"], flights=16)
-    flushing = "from quadsim.features.campaign import store; store.FLUSH_S = 0.2"
-    often = f"{flushing}; from quadsim.commands.cli import main; main()"
+    stores_often = "from quadsim.features.campaign import store; store.FLUSH_S = 0.2"
+    program = f"{stores_often}; from quadsim.commands.cli import main; main()"
     options = ("little.toml", "--out", "c", "--workers", "2", "--no-report", "--resume")
-    command = [sys.executable, "-c", often, "campaign", *options]
+    command = [sys.executable, "-c", program, "campaign", *options]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     parts = tmp_path / "c" / "parts"
-    for kept in range(3):  # once a part more than the last time is there
+    for stored_before in range(3):
         process = subprocess.Popen(command, cwd=tmp_path, env=environment)
-        while len(list(parts.glob("*"))) <= kept:
-            assert process.poll() is None, "it ended, or no part came"
+        while len(list(parts.glob("*"))) <= stored_before:
+            assert process.poll() is None, "it ended before another part was stored"
             clock.sleep(0.02)
         process.kill()
         process.wait()
@@ -274,7 +288,7 @@ def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> 
         assert (tmp_path / "c" / name).read_bytes() == (again.directory / name).read_bytes()
 
 
-def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path: Path) -> None:
+def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight_whoever_flies_it(tmp_path: Path) -> None:
     plan = make_plan(tmp_path, flights=40)
     by_one = fly_campaign(plan, tmp_path / "one", Alone(), until_width=0.5)
     by_two = fly_campaign(plan, tmp_path / "two", 2, until_width=0.5)
@@ -293,21 +307,29 @@ def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     manifest = read_manifest(result.directory)
     assert manifest == result.manifest
     assert (manifest["name"], manifest["status"], manifest["flights"]) == ("little", "complete", 12)
-    summary = json.loads((result.directory / SUMMARY_FILE).read_text())
-    assert {"campaign.toml", "scenario.toml", "flights.parquet"} <= set(summary["files"])
-    assert summary["unhashed"] == ["index.html", "manifest.json", "timing.parquet"]
     assert manifest["files"] == {"timing.parquet": digest_of(result.directory / "timing.parquet")}
-    page = html.unescape((result.directory / "index.html").read_text(encoding="utf-8"))
-    assert "12 of 12 " in page
-    assert '<a href="summary.json">' in page
-    (definition,) = re.findall(r"Counted as failure: (.*?) m\.", page)
-    events = [parse_event(text) for text in definition.split(", ")]
-    failed = [row for row in result.table.to_pylist() if any(event.holds(row) for event in events)]
-    assert f">{len(failed)} of 12 " in page
     assert manifest["versions"]["mujoco"]
     assert manifest["code"].startswith("sha256:")
     assert manifest["machines"] == {processor_name(): 12}
+    summary = json.loads((result.directory / SUMMARY_FILE).read_text())
+    assert {"campaign.toml", "scenario.toml", "flights.parquet"} <= set(summary["files"])
+    assert summary["unhashed"] == ["index.html", "manifest.json", "timing.parquet"]
     assert read_table(result.directory / "flights.parquet").equals(result.table)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_page_counts_the_flights_that_fail_by_the_definition_it_states(plan: Plan, tmp_path: Path) -> None:
+    result = fly_campaign(plan, tmp_path / "c", Alone(), report=True)
+    page = html.unescape((result.directory / "index.html").read_text(encoding="utf-8"))
+    assert "12 of 12 " in page
+    assert '<a href="summary.json">' in page
+    (definition,) = re.findall(r"Counted as failure: (.*?) m\.", page)  # the unit of the last event's number
+    events = [parse_event(text) for text in definition.split(", ")]
+    failed = 0
+    for row in result.table.to_pylist():
+        failed += any(event.holds(row) for event in events)
+    assert 0 < failed < 12
+    assert f">{failed} of 12 " in page
 
 
 # --- what is refused -----------------------------------------------------------------------------------------------
@@ -343,20 +365,20 @@ def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
 def test_other_code_does_not_go_on_with_it(
     plan: Plan, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
+    monkeypatch.setattr(store, "code_digest", lambda: "sha256:other")
     with pytest.raises(InputError, match=r"\(code\)"):
         fly_campaign(make_plan(tmp_path, flights=13), flown, Alone(), resume=True)
-    saved = fly_campaign(plan, flown, Alone(), resume=True)
-    assert saved.manifest["code"] != "sha256:other", "nothing is missing: what flew it stays there"
+    complete = fly_campaign(plan, flown, Alone(), resume=True)
+    assert complete.manifest["code"] != "sha256:other", "no flight is missing: the code that flew them stays stated"
 
 
 def test_another_controller_of_the_user_does_not_go_on_with_it(tmp_path: Path) -> None:
     code = "def law(now, state, reference):\n    return [{speed}] * 4\n"
-    flown = {"duration": 0.5, "constraints": [], "controller": "hovers:law"}
+    settings = {"duration": 0.5, "constraints": [], "controller": "hovers:law"}
     (tmp_path / "hovers.py").write_text(code.format(speed=192.8), encoding="utf-8")
-    fly_campaign(make_plan(tmp_path, set=flown, flights=2), tmp_path / "c", Alone())
+    fly_campaign(make_plan(tmp_path, set=settings, flights=2), tmp_path / "c", Alone())
     (tmp_path / "hovers.py").write_text(code.format(speed=193.8), encoding="utf-8")
-    more = make_plan(tmp_path, set=flown, flights=3)
+    more = make_plan(tmp_path, set=settings, flights=3)
     with pytest.raises(InputError, match=r"\(controller\)"):
         fly_campaign(more, tmp_path / "c", Alone(), resume=True)
 
@@ -372,7 +394,8 @@ def test_grids_are_gone_through_in_whole_turns(tmp_path: Path) -> None:
     plan = make_plan(tmp_path, flights=60, vary=[grid], failure=["lost"])
     result = fly_campaign(plan, tmp_path / "c", Alone(), until_width=0.3)
     drawn = result.table["draw.turn"].to_pylist()
-    assert {drawn.count(value) for value in (0.0, 1.0, 2.0)} == {10}
+    for value in (0.0, 1.0, 2.0):
+        assert drawn.count(value) == 10
 
 
 @pytest.mark.parametrize("dies_after", ["manifest.json", "campaign.toml"])
@@ -382,20 +405,20 @@ def test_dying_while_it_grows_locks_nothing_out(
     more = make_plan(tmp_path, flights=15)
     write = Growing.write
 
-    def then_dies(self: Growing, files: Mapping[str, bytes]) -> None:
+    def write_and_die(self: Growing, files: Mapping[str, bytes]) -> None:
         write(self, files)
         if dies_after in files:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Growing, "write", then_dies)
+        patch.setattr(Growing, "write", write_and_die)
         with pytest.raises(KeyboardInterrupt):
             fly_campaign(more, flown, Alone(), resume=True)
     assert fly_campaign(more, flown, Alone(), resume=True).table.num_rows == 15
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
+def test_a_report_of_fewer_flights_is_removed(plan: Plan, tmp_path: Path) -> None:
     fly_campaign(plan, tmp_path / "c", Alone(), report=True)
     fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)
     assert not (tmp_path / "c" / "index.html").exists()
@@ -414,35 +437,39 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result) -> None:
         assert flight.log.control.t.size == 10
 
 
-def test_a_replay_reports_when_numbers_differ(whole: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_names_the_columns_that_differ(whole: Result) -> None:
     recorded = recorded_flight(whole.directory, 3)
-    other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
-    flight = Rollout(other.scenario).fly()
-    assert sorted(compare_replay(flight, other).differing) == ["draw.mass", "gone", "rmse.z"]
-    monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
+    altered = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
+    flight = Rollout(altered.scenario).fly()
+    assert sorted(compare_replay(flight, altered).differing) == ["draw.mass", "gone", "rmse.z"]
+
+
+def test_a_replay_by_other_code_is_noted(whole: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "code_digest", lambda: "sha256:other")
     (note,) = recorded_flight(whole.directory, 3).notes
     assert "other code" in note
 
 
 def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> None:
-    times = flown / "timing.parquet"
-    kept = times.read_bytes()
-    times.write_bytes(b"")
+    timing = flown / "timing.parquet"
+    content_before = timing.read_bytes()
+    timing.write_bytes(b"")
     with pytest.raises(InputError, match=r"timing\.parquet"):
         recorded_flight(flown, 0)
-    times.write_bytes(kept)
-    path = flown / "scenario.toml"
-    path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
+    timing.write_bytes(content_before)
+    scenario = flown / "scenario.toml"
+    scenario.write_text(scenario.read_text().replace("duration = 0.5", "duration = 0.6"))
     with pytest.raises(InputError, match=r"scenario\.toml"):
         recorded_flight(flown, 0)
 
 
 def test_rows_of_flights_in_the_core_are_those_of_the_loop() -> None:
+    """But for the clock times that they took."""
     plan = load_plan("paper-robustness-robust", ["duration=2"])
     for flight in (0, 1):
         assert Rollout(plan.of(flight)).core_law is not None
         row = plan.fly(flight)
-        usual = plan.row_of(flight, Rollout(plan.of(flight)).fly())
-        differing = {name for name in usual if row[name] != usual[name]}
-        assert differing <= {*TIMES}
-        assert row["machine"] == usual["machine"]
+        of_loop = plan.row_of(flight, Rollout(plan.of(flight)).fly())
+        for name in of_loop.keys() - {*TIMES}:
+            assert row[name] == of_loop[name], name
+        assert row["machine"] == of_loop["machine"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,8 @@ def test_the_interval_is_that_of_scipy(count: int, trials: int) -> None:
     assert (result["lower"], result["upper"]) == pytest.approx((exact.low, exact.high), abs=1e-9)
     one_sided = stats.binomtest(count, trials, alternative="less").proportion_ci(0.95, method="exact")
     assert result["upper_one_sided"] == pytest.approx(one_sided.high, abs=1e-9)
-    other = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
-    assert lower_bounds(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
+    from_below = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
+    assert lower_bounds(count, trials, 0.9) == pytest.approx(from_below.low, abs=1e-9)
     assert result["share"] == count / trials
 
 
@@ -59,13 +60,15 @@ def test_bounds_in_closed_form() -> None:
 @pytest.mark.parametrize("p", [0.002, 0.03, 0.2, 0.5, 0.97])
 @pytest.mark.parametrize("n", [5, 40, 400])
 def test_bounds_have_their_nominal_coverage(n: int, p: float) -> None:
-    """The coverage, summed over every possible count."""
+    """The probability of a bound on the right side of p, summed over every possible count."""
     counts = np.arange(n + 1.0)
-    chance = stats.binom.pmf(counts, n, p)
+    probabilities = stats.binom.pmf(counts, n, p)
     trials = np.full(n + 1, float(n))
     for confidence in (0.9, 0.95, 0.99):
-        assert chance[upper_bounds(counts, trials, confidence) >= p].sum() >= confidence - 1e-12
-        assert chance[lower_bounds(counts, trials, confidence) <= p].sum() >= confidence - 1e-12
+        is_above = upper_bounds(counts, trials, confidence) >= p
+        is_below = lower_bounds(counts, trials, confidence) <= p
+        assert probabilities[is_above].sum() >= confidence - 1e-12
+        assert probabilities[is_below].sum() >= confidence - 1e-12
 
 
 def test_intervals_cover_simulated_campaigns() -> None:
@@ -76,12 +79,14 @@ def test_intervals_cover_simulated_campaigns() -> None:
 
 
 def test_holm_gives_the_numbers_of_r() -> None:
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])  # p.adjust
+    """Of `p.adjust(p, "holm")`; in closed form, no number is above 1."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.5, 0.6]) == [1.0, 1.0]
     assert holm([]) == []
 
 
 def test_holm_keeps_the_chance_of_a_false_find() -> None:
+    """Of any among nine tests of which none has an effect: 5 %."""
     p = np.random.default_rng(3).uniform(size=(4000, 9))
     false_finds = [min(holm(list(row))) < 0.05 for row in p]
     assert np.mean(false_finds) == pytest.approx(0.05, abs=0.012)
@@ -103,7 +108,8 @@ def test_paired_difference_is_that_of_scipy() -> None:
     assert (result.mean, result.lower, result.upper) == pytest.approx((np.mean(b - a), interval.low, interval.high))
 
 
-def test_paired_difference_covers() -> None:
+def test_intervals_of_a_paired_difference_cover_its_mean() -> None:
+    """In nearly 95 % of the cases: of a skewed distribution, the t interval is a little short."""
     rng = np.random.default_rng(6)
     covered = 0
     for _ in range(600):
@@ -111,10 +117,10 @@ def test_paired_difference_covers() -> None:
         assert difference.lower is not None
         assert difference.upper is not None
         covered += difference.lower <= 1.0 <= difference.upper
-    assert 0.89 < covered / 600 < 0.97  # of a skewed distribution, the t interval is a little short
+    assert 0.89 < covered / 600 < 0.97
 
 
-def test_paired_difference_of_few() -> None:
+def test_a_paired_difference_of_few_pairs_has_no_interval_and_one_of_equal_values_has_no_width() -> None:
     none = paired_difference(np.empty(0), np.empty(0))
     assert (none.pairs, none.mean, none.lower) == (0, None, None)
     one = paired_difference(np.array([1.0]), np.array([3.0]))
@@ -124,6 +130,7 @@ def test_paired_difference_of_few() -> None:
 
 
 def related(x: np.ndarray, y: np.ndarray) -> Dependence | None:
+    """`dependence` with the same random numbers each time."""
     return dependence(x, y, np.random.default_rng(0))
 
 
@@ -137,17 +144,31 @@ def test_rank_correlation_is_that_of_scipy() -> None:
     assert (result.rho, result.p, result.flights) == pytest.approx((expected.statistic, expected.pvalue, 200), rel=1e-9)
 
 
-def test_rank_correlation_of_what_is_not_there() -> None:
+def test_numbers_that_do_not_vary_and_fewer_than_ten_pairs_are_not_tested() -> None:
     x = np.arange(20.0)
     assert related(x, np.zeros(20)) is None
-    assert related(x[:9], x[:9]) is None, "Student's t would be sure of it"
+    assert related(np.zeros(20), x) is None
     assert related(x, np.full(20, np.nan)) is None
-    gaps = related(np.append(x, np.nan), np.append(-x, 3.0))
-    assert gaps is not None
-    assert (gaps.rho, gaps.flights) == (pytest.approx(-1.0), 20)
-    with_loss = related(x, np.where(x > 17.0, -np.inf, -x))
-    assert with_loss is not None
-    assert with_loss.rho < -0.99
+    assert related(x[:9], x[:9]) is None
+    assert related(x[:10], x[:10]) is not None
+
+
+def test_pairs_with_a_missing_number_are_left_out() -> None:
+    x = np.arange(20.0)
+    result = related(np.append(x, np.nan), np.append(-x, 3.0))
+    assert result is not None
+    assert (result.rho, result.flights) == (pytest.approx(-1.0), 20)
+
+
+def test_lost_flights_rank_below_all_others() -> None:
+    """Their margin is -inf; a pair beside them lacks a number."""
+    x = np.arange(20.0)
+    falling = -x
+    falling[18:] = -np.inf
+    result = related(np.append(x, np.nan), np.append(falling, 3.0))
+    assert result is not None
+    assert result.rho < -0.99
+    assert result.flights == 20
 
 
 def bowl(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -175,63 +196,63 @@ def test_xi_is_that_of_scipy_with_its_asymptotic_distribution() -> None:
     assert (result.xi, result.p_xi, result.flights) == (expected.statistic, expected.pvalue, 300)
 
 
-def test_an_event_that_depends_on_a_number_is_found_and_a_rare_one_by_chance_is_not() -> None:
-    """Where the mass is far from 1 on either side; and in 3 of 200 flights, of which two are neighbours."""
+def test_an_event_that_depends_on_a_number_is_found() -> None:
+    """It happens where the mass is far from 1, on either side; the test is that of Kolmogorov and Smirnov."""
     mass, _ = bowl(200, 3)
     far = np.abs(mass - 1.0) > 0.15
-    found = related(mass, far * 1.0)
-    assert found is not None
-    assert found.p_xi == stats.ks_2samp(mass[far], mass[~far]).pvalue
-    assert found.p_xi < 1e-6
+    result = related(mass, far * 1.0)
+    assert result is not None
+    assert result.p_xi == stats.ks_2samp(mass[far], mass[~far]).pvalue
+    assert result.p_xi < 1e-6
+
+
+def test_a_rare_event_that_happens_by_chance_is_not_found() -> None:
+    """In 3 of 200 flights, of which two are neighbours: xi's own test would take it for a dependence."""
     x = np.arange(200.0)
-    rare = np.isin(x, (50.0, 51.0, 140.0)) * 1.0
-    by_chance = related(x, rare)
-    assert by_chance is not None
-    assert by_chance.p_xi > 0.05 > stats.chatterjeexi(x, rare).pvalue
+    happened = np.isin(x, (50.0, 51.0, 140.0)) * 1.0
+    result = related(x, happened)
+    assert result is not None
+    assert result.p_xi > 0.05
+    assert stats.chatterjeexi(x, happened).pvalue < 0.05
 
 
 def largest_share(runs: int) -> float:
-    """5 %, and three standard deviations of the share of p values below it that chance gives."""
+    """The share of runs with p below 0.05 that chance alone does not exceed: 5 % and three standard deviations."""
     return 0.05 + 3.0 * math.sqrt(0.05 * 0.95 / runs)
 
 
 @pytest.mark.slow("statistics")
 def test_the_p_value_of_xi_has_its_nominal_level() -> None:
-    """Of few and many pairs, of numbers, of rare events, and of a varied parameter with few values."""
+    """Of few and many pairs, of numbers and rare events, varied over many values and over four."""
     rng = np.random.default_rng(3)
 
-    def few_values(size: int) -> np.ndarray:
+    def four_values(size: int) -> np.ndarray:
         return rng.integers(0, 4, size) * 1.0
 
     def rare_events(size: int) -> np.ndarray:
         return (rng.random(size) < 0.1) * 1.0
 
-    for n, runs in ((15, 30), (60, 100), (300, 60)):
-        for draw_y in (rng.standard_normal, rare_events):
-            for draw_x in (rng.random, few_values):
-                results = [dependence(draw_x(n), draw_y(n), rng) for _ in range(runs)]
-                p = np.array([result.p_xi for result in results if result is not None])
-                assert np.mean(p < 0.05) < largest_share(p.size), (n, p.size)
-
-
-def test_xi_of_what_is_not_there() -> None:
-    x = np.arange(20.0)
-    assert related(np.zeros(20), x) is None
-    with_loss = related(np.append(x, np.nan), np.where(np.arange(21) > 17, -np.inf, np.arange(21.0)))
-    assert with_loss is not None
-    assert with_loss.flights == 20
+    sizes = ((15, 30), (60, 100), (300, 60))
+    for (n, runs), draw_y, draw_x in product(sizes, (rng.standard_normal, rare_events), (rng.random, four_values)):
+        p = []
+        for _ in range(runs):
+            result = dependence(draw_x(n), draw_y(n), rng)
+            if result is not None:  # else no such event happened
+                p.append(result.p_xi)
+        assert np.mean(np.array(p) < 0.05) < largest_share(len(p)), (n, len(p))
 
 
 MakeCampaign = Callable[..., pa.Table]
-NONE = ("incomplete", "unaudited", "died", "timeout", "memory")
+UNSEEN = ("incomplete", "unaudited", "died", "timeout", "memory")
+"""Verdicts that no flight of `small` has; events have the same names."""
 
 
 def with_columns(table: pa.Table, columns: dict[str, list[Any]]) -> pa.Table:
     """A table with other values in some columns."""
     for name, values in columns.items():
-        i = table.column_names.index(name)
-        field = table.schema.field(i)
-        table = table.set_column(i, field, pa.array(values, field.type))
+        place = table.column_names.index(name)
+        field = table.schema.field(place)
+        table = table.set_column(place, field, pa.array(values, field.type))
     return table
 
 
@@ -261,10 +282,10 @@ def small() -> pa.Table:
 def test_events_and_verdicts_are_counted(small: pa.Table) -> None:
     result = estimate(small)
     assert result["flights"] == 8
-    assert result["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1} | dict.fromkeys(NONE, 0)
+    unseen = dict.fromkeys(UNSEEN, 0)
+    assert result["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1} | unseen
     counts = {name: event["count"] for name, event in result["events"].items()}
-    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1} | dict.fromkeys(NONE, 0)
-    assert counts == expected
+    assert counts == {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1} | unseen
     assert [line[0].text for line in event_table(result).lines] == ["failure", "violation", "lost", "crash", "error"]
     failure = result["events"]["failure"]
     exact = stats.binomtest(6, 8).proportion_ci(0.95)
@@ -310,8 +331,13 @@ def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) 
 
 
 def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(small: pa.Table) -> None:
-    columns = {"verdict": ["incomplete"], "failed": [False], "violated": [False], "satisfied.roll": [None]}
-    table = with_columns(small, {name: 8 * value for name, value in columns.items()})
+    columns: dict[str, list[Any]] = {
+        "verdict": ["incomplete"] * 8,
+        "failed": [False] * 8,
+        "violated": [False] * 8,
+        "satisfied.roll": [None] * 8,
+    }
+    table = with_columns(small, columns)
     result = estimate(table)
     assert verdict_sentence(result).startswith("0 of 0 ")
     assert result["events"]["failure"]["flights"] == 0
@@ -321,29 +347,41 @@ def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(smal
         compare_pairs(table, table, ("one", "other"))
 
 
-def test_of_tied_flights_the_first_is_the_worst(thousand: pa.Table) -> None:
-    """Margins that are equal but for rounding, as of a wind from either side."""
+@pytest.fixture
+def six(thousand: pa.Table) -> pa.Table:
+    """Six flights whose constraints hold, not in the order of their numbers."""
+    columns: dict[str, list[Any]] = {"verdict": ["satisfied"] * 6, "failed": [False] * 6, "flight": [5, 1, 4, 2, 3, 0]}
+    return with_columns(thousand.slice(0, 6), columns)
+
+
+def ranked(flights: pa.Table) -> list[int]:
+    """The numbers of the flights, the worst first."""
+    return np.array(flights["flight"])[ranking(flights)].tolist()
+
+
+def test_margins_that_differ_by_rounding_rank_by_the_numbers_of_their_flights(six: pa.Table) -> None:
+    """As those of a wind from either side: 1, 3 and 4 have the same margin, and so have 0 and 2."""
     rng = np.random.default_rng(0)
     limits = (Limit(name="roll", signal="roll", lower=-5.0, upper=5.0),)
-    columns = {"verdict": ["satisfied"] * 6, "failed": [False] * 6, "flight": [5, 1, 4, 2, 3, 0]}
-    table = with_columns(thousand.slice(0, 6), columns)
-
-    def order(flights: pa.Table) -> list[int]:
-        return np.array(flights["flight"])[ranking(flights)].tolist()
-
     for _ in range(20):
-        shares = np.array([0.9, 0.2, 0.2, 0.5, 0.2, 0.5]) + 3e-6 * rng.uniform(-1.0, 1.0, 6)
-        shaken = with_columns(table, {"worst_margin": shares.tolist(), "margin.roll": (5.0 * shares).tolist()})
-        assert order(shaken) == [1, 3, 4, 0, 2, 5]
-        assert worst_flight(shaken) == 1
-        roll = estimate(shaken, limits)["constraints"]["roll"]
+        margins = np.array([0.9, 0.2, 0.2, 0.5, 0.2, 0.5]) + 3e-6 * rng.uniform(-1.0, 1.0, 6)
+        table = with_columns(six, {"worst_margin": margins.tolist(), "margin.roll": (5.0 * margins).tolist()})
+        assert ranked(table) == [1, 3, 4, 0, 2, 5]
+        assert worst_flight(table) == 1
+        roll = estimate(table, limits)["constraints"]["roll"]
         assert roll["worst_flight"] == 1
-        assert roll["worst_margin"] == 5.0 * shares.min()
-        errors: dict[str, list[Any]] = {"worst_margin": [None] * 6}
+        assert roll["worst_margin"] == 5.0 * margins.min()
+
+
+def test_errors_that_differ_by_rounding_rank_by_the_numbers_of_their_flights(six: pa.Table) -> None:
+    """Flights without margins."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        columns: dict[str, list[Any]] = {"worst_margin": [None] * 6}
         for axis in "xyz":
-            relative = 1.0 + 3e-6 * rng.uniform(-1.0, 1.0, 6)
-            errors[f"rmse.{axis}"] = (relative * [1.0, 3.0, 3.0, 2.0, 3.0, 2.0]).tolist()
-        assert order(with_columns(shaken, errors)) == [1, 3, 4, 0, 2, 5]
+            errors = np.array([1.0, 3.0, 3.0, 2.0, 3.0, 2.0]) * (1.0 + 3e-6 * rng.uniform(-1.0, 1.0, 6))
+            columns[f"rmse.{axis}"] = errors.tolist()
+        assert ranked(with_columns(six, columns)) == [1, 3, 4, 0, 2, 5]
 
 
 def test_the_worst_flights_come_first(small: pa.Table) -> None:
@@ -371,9 +409,11 @@ def test_no_flight_is_no_worst(small: pa.Table) -> None:
 
 
 def test_a_lost_flight_without_margin_ranks_below_all(small: pa.Table) -> None:
+    """Of the flights twice, as fewer than ten are not tested."""
     result = estimate(pa.concat_tables([small, small]))["parameters"]["mass"]["worst_margin"]
     mass = [1.0, 1.3, 1.1, 1.5, 1.4, 1.6, 0.9]
-    expected = stats.spearmanr(2 * mass, 2 * [0.5, -0.1, 0.2, -3.0, -0.4, -1e9, 0.8]).statistic
+    margin = [0.5, -0.1, 0.2, -3.0, -0.4, -1e9, 0.8]
+    expected = stats.spearmanr(2 * mass, 2 * margin).statistic
     assert result["rho"] == pytest.approx(expected)
     assert result["flights"] == 14
 
@@ -401,7 +441,8 @@ def test_nothing_goes_with_what_never_happens(make_campaign: MakeCampaign) -> No
     result = estimate(make_campaign(40, severity=0.0))
     assert result["events"]["failure"]["count"] == 0
     for entry in result["parameters"].values():
-        assert entry["kind"] != "number" or entry["failed"] is None
+        if entry["kind"] == "number":
+            assert entry["failed"] is None
 
 
 @pytest.mark.parametrize("flights", [0, 1, 2, 5])
@@ -418,18 +459,22 @@ def test_the_summary_of_a_thousand_is_strict_json(thousand: pa.Table) -> None:
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert len(result["worst"]) == 10
     assert result["metrics"]["rmse.x"]["unit"] == "m"
-    assert not [name for name in result["metrics"] if name.startswith(("draw.", "margin.", "time_violated.", "seed"))]
+    for name in result["metrics"]:
+        assert not name.startswith(("draw.", "margin.", "time_violated.", "seed"))
 
 
 def flown(draws: dict[str, Any], margin: np.ndarray, lost: np.ndarray | None = None) -> pa.Table:
-    """Flights of such draws and margins; those below 0 violated and failed, and some were lost."""
+    """Flights of such draws and margins; those below 0 violated and failed, and so did those that were lost."""
     n = margin.size
     if lost is None:
         lost = np.zeros(n, bool)
     bad = (margin < 0.0) | lost
+    verdict = np.full(n, "satisfied")
+    verdict[bad] = "violated"
+    verdict[lost] = "lost"
     columns = {
         "flight": list(range(n)),
-        "verdict": np.where(lost, "lost", np.where(bad, "violated", "satisfied")).tolist(),
+        "verdict": verdict.tolist(),
         "reason": pa.nulls(n, pa.string()),
         "failed": bad,
         "violated": bad,
@@ -442,6 +487,7 @@ def flown(draws: dict[str, Any], margin: np.ndarray, lost: np.ndarray | None = N
 
 
 def bowl_table(n: int, seed: int) -> pa.Table:
+    """Flights whose margin falls on both sides of a mass of 1 and depends on no other draw."""
     rng = np.random.default_rng(seed)
     draws = {name: rng.uniform(0.8, 1.2, n) for name in ("mass", "inertia", "lag", "wind")}
     margin = 0.6 - 3.0 * np.abs(draws["mass"] - 1.0) + 0.1 * rng.normal(size=n)
@@ -450,14 +496,14 @@ def bowl_table(n: int, seed: int) -> pa.Table:
 
 @pytest.mark.parametrize("n", [40, 200, 1000])
 def test_harm_at_both_ends_is_reported(n: int) -> None:
-    """The margin falls with the distance of the mass from 1: a rank correlation alone found nothing."""
+    """The margin falls with the distance of the mass from 1: a rank correlation alone finds nothing."""
     summary = estimate(bowl_table(n, 4))
     result = summary["parameters"]["mass"]["worst_margin"]
     assert result["p_holm"] > 0.05
     assert result["p_xi_holm"] < 0.05
     assert "mass (rho " in driver_sentence(summary)
-    line = driver_table(summary).lines[0]
-    assert (line[0].text, line[1].mark, line[3].mark) == ("mass", "", "best")
+    name, rho, _, xi = driver_table(summary).lines[0][:4]
+    assert (name.text, rho.mark, xi.mark) == ("mass", "", "best")
 
 
 def outcomes(result: dict[str, Any]) -> list[dict[str, Any]]:
@@ -471,22 +517,24 @@ def test_both_measures_are_corrected_together() -> None:
     pairs = [(test["p"], test["p_holm"]) for test in tests]
     pairs += [(test["p_xi"], test["p_xi_holm"]) for test in tests]
     least, corrected = min(pairs)
-    assert corrected == pytest.approx(len(pairs) * least)
+    assert least > 0.0
+    assert corrected == pytest.approx(16 * least, rel=1e-9, abs=0.0)  # Holm: the least of 16, by their number
 
 
 @pytest.mark.slow("statistics")
 def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None:
-    """Over 60 campaigns in which nothing matters: any claim, of any measure, varied parameter or outcome."""
+    """Of 60 campaigns in which nothing matters, counted are those with any claim at all."""
     rng = np.random.default_rng(6)
+    campaigns = 60
     claims = 0
     n = 60
-    for _ in range(60):
+    for _ in range(campaigns):
         draws = {name: rng.uniform(size=n) for name in ("mass", "lag", "wind", "noise")}
         draws["horizon"] = rng.integers(0, 5, n)
         table = flown(draws, 0.3 + rng.standard_cauchy(n) * 0.2, lost=rng.random(n) < 0.05)
         tests = outcomes(parameters(table))
-        claims += min(min(test["p_holm"], test["p_xi_holm"]) for test in tests) < 0.05
-    assert claims / 60 < largest_share(60)
+        claims += any(test["p_holm"] < 0.05 or test["p_xi_holm"] < 0.05 for test in tests)
+    assert claims / campaigns < largest_share(campaigns)
 
 
 def test_without_drivers_none_is_reported(make_campaign: MakeCampaign) -> None:

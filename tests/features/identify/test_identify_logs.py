@@ -1,8 +1,9 @@
-"""Flight logs, read and checked: each corrupted log is refused or reported by name, and good ones pass in silence."""
+"""Flight logs, read and checked: what is wrong with a log is named in its refusal or in a note; good ones have none."""
 
 from __future__ import annotations
 
 import builtins
+import re
 import struct
 import tomllib
 from collections.abc import Callable
@@ -38,15 +39,19 @@ FIELDS = {
     "commands": "u1 u2 u3 u4",
 }
 """Of a record, with the names of their columns."""
-NOISE = {"position": 0.002, "velocity": 0.02, "attitude": 0.26, "rates": 0.43}
+NOISE = {"position": 0.002, "velocity": 0.02, "attitude": 0.26, "rates": 0.43}  # [m], [m/s], [deg], [deg/s]
+FULL = 838.0  # [rad/s] at full throttle
+HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x, of axes front, left, up into front, right, down and back
 Corruption = Callable[[Record], Record]
+"""What makes a good log a corrupted one."""
 Topics = dict[str, tuple[str, Array, Array]]
 
 
 def flown(vehicle: str, course: str, **changes: Any) -> Flight:
-    """Eight seconds at 100 Hz, seen through sensors, under torque noise like the Hummingbird's 0.01 N m s^0.5."""
+    """Eight seconds at 100 Hz through sensors, with torque noise of 0.01 N m s^0.5 for the Hummingbird's inertia."""
     scenario = quadsim.scenario(vehicle=vehicle, course=course, controller="geometric").scenario
-    noise = 0.01 * quadsim.load_vehicle(vehicle).inertia[0] / quadsim.load_vehicle("hummingbird").inertia[0]
+    relative_inertia = quadsim.load_vehicle(vehicle).inertia[0] / quadsim.load_vehicle("hummingbird").inertia[0]
+    noise = 0.01 * relative_inertia
     sensors = {f"sensors.{name}": {"rate": 100.0, "noise": value} for name, value in NOISE.items()}
     usual = {"duration": 8.0, "control_period": 0.01, "effects.disturbance.torque_noise": noise}
     return quadsim.fly(scenario.replace({**usual, **sensors, **changes}))
@@ -64,6 +69,7 @@ def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def eight(run_directory: Path) -> Record:
+    """That flight, as it is read: a good log."""
     return read_record(run_directory)
 
 
@@ -73,6 +79,7 @@ def hummingbird() -> Vehicle:
 
 
 def notes(record: Record, vehicle: Vehicle) -> tuple[str, ...]:
+    """What the checks of a log note about it; they raise where it cannot be used."""
     return check_log(record, vehicle, airborne_spans(record, vehicle))
 
 
@@ -95,11 +102,14 @@ def write_csv(path: Path, table: dict[str, Array], *, without: str = "", rows: A
 
 
 def late(record: Record, count: int, *fields: str) -> Record:
-    """The record with some fields `count` samples late."""
-    shifted = {}
-    for name in ("t", *FIELDS):
+    """The record with some fields `count` samples late: the others and not the times lack their first ones."""
+    shifted: dict[str, Any] = {"t": record.t[:-count]}
+    for name in FIELDS:
         rows = getattr(record, name)
-        shifted[name] = rows[:-count] if name in fields or name == "t" else rows[count:]
+        if name in fields:
+            shifted[name] = rows[:-count]
+        else:
+            shifted[name] = rows[count:]
     return replace(record, **shifted, voltage=None)
 
 
@@ -107,8 +117,8 @@ def late(record: Record, count: int, *fields: str) -> Record:
 
 
 @pytest.mark.representative("identification")
-def test_run_directory(run_directory: Path, eight: Record) -> None:
-    """What was measured, the command of each period, and the battery's voltage from the plant's table."""
+def test_a_run_directory_is_a_log(run_directory: Path, eight: Record) -> None:
+    """With a command for each period and the battery's voltage; quaternions of length one that do not change sign."""
     assert eight.name == read_record(run_directory / "flight.parquet").name == run_directory.name
     assert eight.commands is not None
     assert eight.position is not None
@@ -117,7 +127,8 @@ def test_run_directory(run_directory: Path, eight: Record) -> None:
     assert eight.period == pytest.approx(0.01)
     assert 9.0 < eight.voltage.min() < eight.voltage.max() < 13.0
     np.testing.assert_allclose(np.linalg.norm(eight.attitude, axis=1), 1.0)
-    assert ((eight.attitude[1:] * eight.attitude[:-1]).sum(axis=1) > 0.9).all()
+    cosine_of_half_turns = (eight.attitude[1:] * eight.attitude[:-1]).sum(axis=1)
+    assert (cosine_of_half_turns > 0.9).all()
 
 
 def test_csv_is_read_unchanged(tmp_path: Path, eight: Record) -> None:
@@ -140,14 +151,16 @@ def test_other_names_units_and_separators(tmp_path: Path, eight: Record) -> None
     path.write_text(path.read_text().replace(",", ";"))
     read = read_record(path)
     np.testing.assert_allclose(read.t, eight.t, atol=1e-9)
-    np.testing.assert_allclose(np.abs((read.attitude * eight.attitude).sum(axis=1)), 1.0)
+    cosine_of_half_error = (read.attitude * eight.attitude).sum(axis=1)
+    np.testing.assert_allclose(np.abs(cosine_of_half_error), 1.0)
     np.testing.assert_allclose(read.speeds, eight.commands)
     np.testing.assert_allclose(read.rates, eight.rates)
+    np.testing.assert_allclose(read.velocity, eight.velocity)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 3e-3])
 def test_clock_is_made_uniform(tmp_path: Path, eight: Record, jitter: float) -> None:
-    """Stamps in whole milliseconds are rounded ones of a uniform clock; others are sampled anew, commands held."""
+    """Rows with stamps in whole milliseconds stay as they are; with others they are interpolated, and commands held."""
     stamps = np.round(eight.t * 1.037, 3) + jitter * np.sin(np.arange(800.0))
     read = read_record(write_csv(tmp_path / "c.csv", columns(eight, t=stamps)))
     steps = np.diff(read.t)
@@ -160,8 +173,9 @@ def test_clock_is_made_uniform(tmp_path: Path, eight: Record, jitter: float) -> 
         np.testing.assert_allclose(read.rates, eight.rates)
 
 
-def test_gaps(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
-    """Three rows missing are bridged; thirty are a gap that spans leave out."""
+def test_three_missing_rows_are_bridged_and_thirty_are_a_gap_that_is_left_out(
+    tmp_path: Path, eight: Record, hummingbird: Vehicle
+) -> None:
     assert eight.commands is not None
     rows = np.r_[0:100, 103:300, 330:800]
     read = read_record(write_csv(tmp_path / "d.csv", columns(eight), rows=rows))
@@ -174,12 +188,16 @@ def test_gaps(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     (note,) = check_log(read, hummingbird, parts)
     assert "3.7 % of its samples" in note
     assert "t = 3 s" in note
-    short = read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650]))
+
+
+def test_a_log_whose_longest_span_is_too_short_is_refused(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    """A gap after 3 s, and 3.2 s after it."""
+    record = read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650]))
     with pytest.raises(InputError, match=r"3\.. s"):
-        airborne_spans(short, hummingbird)
+        airborne_spans(record, hummingbird)
 
 
-def test_log_without_a_whole_row(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+def test_a_log_without_a_whole_row_is_refused(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     nothing = np.full(800, np.nan)
     record = read_record(write_csv(tmp_path / "n.csv", columns(eight, vx=nothing)))
     with pytest.raises(InputError, match="0 % "):
@@ -189,31 +207,58 @@ def test_log_without_a_whole_row(tmp_path: Path, eight: Record, hummingbird: Veh
         read_record(path)
 
 
-def test_erpm(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
-    """ERPM / (poles / 2) = rpm; 65535 is a gap; poles are asked for, and a wrong count is named."""
-    table = columns(eight)
+@pytest.fixture(scope="module")
+def lagged_speeds(eight: Record) -> Array:
+    """The speeds of the Hummingbird's rotors, which lag behind the commands of `eight` [rad/s]."""
     assert eight.commands is not None
-    speeds = lagged_rotors(eight.commands, eight.period, rise=0.0125, fall=0.025, delay=0.0).speeds
-    erpm = {f"erpm{i}": 7.0 * speeds[:, i - 1] * 60.0 / (2.0 * np.pi) for i in range(1, 5)}
+    return lagged_rotors(eight.commands, eight.period, rise=0.0125, fall=0.025, delay=0.0).speeds
+
+
+def write_erpm(path: Path, record: Record, speeds: Array) -> Path:
+    """A log of motors with 14 poles, 7 pairs, without commands; in row 50, the second rotor has no value, 65535."""
+    erpm = {}
+    for i in range(4):
+        rpm = speeds[:, i] * 60.0 / (2.0 * np.pi)
+        erpm[f"erpm{i + 1}"] = 7.0 * rpm
     erpm["erpm2"][50] = 65535
-    path = write_csv(tmp_path / "f.csv", {**table, **erpm}, without="u1 u2 u3 u4")
-    read = read_record(path, poles=14)
+    return write_csv(path, {**columns(record), **erpm}, without="u1 u2 u3 u4")
+
+
+def test_erpm_is_divided_by_the_pairs_of_poles(
+    tmp_path: Path, eight: Record, lagged_speeds: Array, hummingbird: Vehicle
+) -> None:
+    """A missing value is interpolated."""
+    read = read_record(write_erpm(tmp_path / "f.csv", eight, lagged_speeds), poles=14)
     assert read.speeds is not None
-    np.testing.assert_allclose(read.speeds[:50], speeds[:50])
+    np.testing.assert_allclose(read.speeds[:50], lagged_speeds[:50])
     np.testing.assert_allclose(read.speeds[50], read.speeds[[49, 51]].mean(axis=0))
     assert notes(read, hummingbird) == ()
-    for poles, cause in ((28, "twice the motor's poles"), (2, "eRPM not divided")):
-        with pytest.raises(InputError, match=cause):
-            notes(read_record(path, poles=poles), hummingbird)
+
+
+@pytest.mark.parametrize(("poles", "cause"), [(28, "twice the motor's poles"), (2, "eRPM not divided")])
+def test_a_wrong_number_of_poles_is_named(
+    tmp_path: Path, eight: Record, lagged_speeds: Array, hummingbird: Vehicle, poles: int, cause: str
+) -> None:
+    record = read_record(write_erpm(tmp_path / "f.csv", eight, lagged_speeds), poles=poles)
+    with pytest.raises(InputError, match=cause):
+        notes(record, hummingbird)
+
+
+def test_poles_are_stated_where_erpm_is_logged_and_nowhere_else(
+    tmp_path: Path, eight: Record, lagged_speeds: Array
+) -> None:
+    """An even number of them."""
+    path = write_erpm(tmp_path / "f.csv", eight, lagged_speeds)
     with pytest.raises(InputError, match="poles"):
         read_record(path)
     with pytest.raises(ParameterError, match="poles"):
         read_record(path, poles=7)
+    without_erpm = write_csv(tmp_path / "g.csv", columns(eight))
     with pytest.raises(InputError, match="erpm"):
-        read_record(write_csv(tmp_path / "g.csv", table), poles=14)
+        read_record(without_erpm, poles=14)
 
 
-def test_velocity_from_position(tmp_path: Path, eight: Record) -> None:
+def test_a_velocity_that_is_not_logged_is_taken_from_the_position(tmp_path: Path, eight: Record) -> None:
     read = read_record(write_csv(tmp_path / "h.csv", columns(eight), without="vx vy vz"))
     (note,) = read.notes
     assert note.startswith("h.csv: no velocity is logged")
@@ -231,8 +276,9 @@ def test_velocity_from_position(tmp_path: Path, eight: Record) -> None:
     ],
 )
 def test_missing_columns_are_named(tmp_path: Path, eight: Record, without: str, lacks: str) -> None:
+    path = write_csv(tmp_path / "i.csv", columns(eight), without=without)
     with pytest.raises(FileError) as error:
-        read_record(write_csv(tmp_path / "i.csv", columns(eight), without=without))
+        read_record(path)
     assert f"lacks {lacks}" in str(error.value)
     assert "it has" in str(error.value)
 
@@ -243,7 +289,7 @@ def test_columns_of_one_name_are_refused(tmp_path: Path, eight: Record) -> None:
         read_record(path)
 
 
-def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
+def test_files_that_are_no_logs_are_refused(tmp_path: Path, eight: Record) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "log.txt").write_bytes(b"")
     (tmp_path / "log.csv").write_bytes(b"\x00\xff")
@@ -270,40 +316,47 @@ def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
         (lambda t: 20.0 * t, "5 samples per second, period 0.2 s; at least 10 Hz"),
     ],
 )
-def test_clocks_that_cannot_be_used(
+def test_clocks_that_cannot_be_used_are_refused(
     tmp_path: Path, eight: Record, change: Callable[[Array], Array], problem: str
 ) -> None:
+    path = write_csv(tmp_path / "j.csv", columns(eight, t=change(eight.t)))
     with pytest.raises(InputError, match=problem):
-        read_record(write_csv(tmp_path / "j.csv", columns(eight, t=change(eight.t))))
+        read_record(path)
 
 
 def test_quaternions_must_be_of_length_one(tmp_path: Path, eight: Record) -> None:
-    table = columns(eight)
+    path = write_csv(tmp_path / "k.csv", columns(eight, qw=eight.attitude[:, 0] - 0.5))
     with pytest.raises(InputError, match="norm"):
-        read_record(write_csv(tmp_path / "k.csv", {**table, "qw": table["qw"] - 0.5}))
+        read_record(path)
 
 
 @pytest.mark.parametrize(
-    ("corrupted", "rule"),
+    ("names", "of", "factors", "offset", "rule"),
     [
-        (lambda table: {f"throttle{i}": 1000.0 + table[f"u{i}"] for i in range(1, 5)}, "throttle1..4 must be shares"),
-        (lambda table: {"w1": -table["u1"], **{f"w{i}": table[f"u{i}"] for i in (2, 3, 4)}}, "must be 0 or above"),
-        (lambda table: {"roll": 40.0 * table["qx"], "pitch": table["qy"], "yaw": table["qz"]}, "must be in rad; got"),
+        ("throttle1 throttle2 throttle3 throttle4", "u1 u2 u3 u4", 1.0, 1000.0, "throttle1..4 must be shares"),
+        ("w1 w2 w3 w4", "u1 u2 u3 u4", [-1.0, 1.0, 1.0, 1.0], 0.0, "must be 0 or above"),
+        ("roll pitch yaw", "qx qy qz", [40.0, 1.0, 1.0], 0.0, "must be in rad; got"),
     ],
 )
-def test_units_that_cannot_be_meant(tmp_path: Path, eight: Record, corrupted: Any, rule: str) -> None:
+def test_numbers_that_their_unit_cannot_have_are_refused(
+    tmp_path: Path, eight: Record, names: str, of: str, factors: Any, offset: float, rule: str
+) -> None:
+    """Columns that are made of others, which the log does not have: pulses, a rotor that turns back, degrees."""
     table = columns(eight)
-    others = corrupted(table)
-    without = "qw" if "roll" in others else "u1"
+    originals = np.stack([table[name] for name in of.split()], axis=1)
+    wrong = dict(zip(names.split(), (offset + originals * factors).T, strict=True))
+    path = write_csv(tmp_path / "l.csv", table | wrong, without=of)
     with pytest.raises(InputError, match=rule):
-        read_record(write_csv(tmp_path / "l.csv", {**table, **others}, without=without))
+        read_record(path)
 
 
 # Checks
 
 
 def negated(field: str, *axes: int) -> Corruption:
-    signs = np.array([-1.0 if axis in axes else 1.0 for axis in range(3)])
+    """A field with the other sign along some axes."""
+    signs = np.ones(3)
+    signs[[*axes]] = -1.0
     return lambda record: replace(record, **{field: getattr(record, field) * signs})
 
 
@@ -318,16 +371,18 @@ def commanded(change: Callable[[Array], Array]) -> Corruption:
 
 
 def reordered(*order: int) -> Corruption:
+    """The commands of the rotors in another order."""
     return commanded(lambda commands: commands[:, list(order)])
 
 
 def z_down(record: Record) -> Record:
-    half_turn = np.array([1.0, -1.0, -1.0])
-    moved = {name: getattr(record, name) * half_turn for name in ("position", "velocity", "rates")}
-    return replace(record, attitude=record.attitude * [1.0, *half_turn], **moved)
+    """World and body axes with z down: NED and FRD."""
+    turned = {name: getattr(record, name) * HALF_TURN for name in ("position", "velocity", "rates")}
+    return replace(record, attitude=record.attitude * [1.0, *HALF_TURN], **turned)
 
 
 def turned_world(record: Record) -> Record:
+    """Position and velocity in a world that is turned by 90 deg against that of the attitude."""
     moved = {name: getattr(record, name)[:, [1, 0, 2]] * [1.0, -1.0, 1.0] for name in ("position", "velocity")}
     return replace(record, **moved)
 
@@ -350,13 +405,14 @@ def swapped_rates(record: Record) -> Record:
 
 
 def still_about_x(record: Record) -> Record:
+    """The rate about x stands still."""
     rates = record.rates.copy()
     rates[:, 0] = 0.1
     return replace(record, rates=rates)
 
 
 def still_attitude(record: Record) -> Record:
-    return replace(record, attitude=np.tile(record.attitude[0], (800, 1)))
+    return replace(record, attitude=np.tile(record.attitude[0], (len(record.t), 1)))
 
 
 def low_throttle(record: Record) -> Record:
@@ -387,6 +443,7 @@ def on_the_ground(record: Record) -> Record:
 
 
 def held_by_a_radio(record: Record, times: int) -> Record:
+    """Each row some times, in the place of those after it."""
     rows = {name: np.repeat(getattr(record, name)[::times], times, axis=0) for name in FIELDS}
     return replace(record, **rows)
 
@@ -437,15 +494,16 @@ CORRUPTED: dict[str, Corruption] = {
 
 
 @pytest.mark.parametrize("name", CORRUPTED)
-def test_corrupted_logs_are_refused_by_name(eight: Record, hummingbird: Vehicle, name: str) -> None:
+def test_corrupted_logs_are_refused_by_what_is_wrong_with_them(eight: Record, hummingbird: Vehicle, name: str) -> None:
+    corrupted = CORRUPTED[name](eight)
     with pytest.raises(InputError, match=name) as error:
-        notes(CORRUPTED[name](eight), hummingbird)
+        notes(corrupted, hummingbird)
     assert str(error.value).startswith(f"{eight.name}: ")
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.5])
 def test_good_log_passes(eight: Record, hummingbird: Vehicle, factor: float) -> None:
-    """In silence, from a start that is far off, too."""
+    """Without a note, also with a start whose thrust coefficient and inertia are half as high again."""
     inertia = tuple(factor * moment for moment in hummingbird.inertia)
     start = replace(hummingbird, thrust_coefficient=factor * hummingbird.thrust_coefficient, inertia=inertia)
     assert airborne_spans(eight, start) == [slice(0, 800)]
@@ -462,7 +520,10 @@ def test_good_log_passes(eight: Record, hummingbird: Vehicle, factor: float) -> 
     ],
 )
 def test_closed_loops_with_torque_noise_pass(tmp_path: Path, vehicle: str, course: str, seed: int) -> None:
-    """A naive regression is weak here: no false alarm, yet swapped rotors and reversed spins are found."""
+    """Without a note; yet swapped rotors, a frame turned by 45 deg and reversed spins are named.
+
+    The feedback hides how commands and motion depend on each other: a regression of the one on the other is biased.
+    """
     write_log(tmp_path, flown(vehicle, course, seed=seed).log, plant_stride=5, metadata={})
     record = read_record(tmp_path)
     start = quadsim.load_vehicle(vehicle)
@@ -479,14 +540,17 @@ def test_closed_loops_with_torque_noise_pass(tmp_path: Path, vehicle: str, cours
 
 
 def test_small_shifts_are_notes(eight: Record, hummingbird: Vehicle) -> None:
+    """Of 10 ms, and of about 40 ms."""
     (note,) = notes(late(eight, 1, "rates"), hummingbird)
     assert "the rates are 10 ms late against the attitude" in note
     (note,) = notes(late(eight, 4, "velocity", "position"), hummingbird)
-    assert "the velocity is 4" in note or "the velocity is 3" in note
+    lateness = re.search(r"the velocity is (\d+)\S* ms late", note)
+    assert lateness is not None
+    assert 30 <= int(lateness[1]) < 50
 
 
 def test_poor_logs_are_notes(eight: Record, hummingbird: Vehicle) -> None:
-    """A slow log, commands clipped, a hover speed that is half as high again."""
+    """25 Hz, commands that are clipped, and a hover speed that is half as high again."""
     assert eight.commands is not None
     slow = replace(eight, **{name: getattr(eight, name)[::4] for name in ("t", *FIELDS, "voltage")})
     assert "25 Hz; below 50 Hz" in "\n".join(notes(slow, hummingbird))
@@ -498,8 +562,8 @@ def test_poor_logs_are_notes(eight: Record, hummingbird: Vehicle) -> None:
     assert "above the start's speed_max of 838 rad/s" in fast
 
 
-def test_ground_is_cut(tmp_path: Path) -> None:
-    """Rotors that spin up, take-off, and landing."""
+def test_what_is_on_the_ground_is_cut(tmp_path: Path) -> None:
+    """At most half a second after take-off, and a second before landing, go with it."""
     write_log(tmp_path, quadsim.fly("take-off-and-landing").log, plant_stride=5, metadata={})
     record = read_record(tmp_path)
     (part,) = airborne_spans(record, quadsim.load_vehicle("lopes2011"))
@@ -512,52 +576,74 @@ def test_ground_is_cut(tmp_path: Path) -> None:
 # ULog
 
 
-def ulog(
-    path: Path,
-    topics: dict[str, tuple[str, Array, Array]],
-    formats: str = "",
-    parameters: dict[str, float] | None = None,
-) -> Path:
-    """Write a ULog: topics with the format of their fields, times [s] and rows of numbers."""
+def message(kind: str, payload: bytes) -> bytes:
+    """A message of a ULog."""
+    return struct.pack("<HB", len(payload), ord(kind)) + payload
 
-    def message(kind: str, payload: bytes) -> bytes:
-        return struct.pack("<HB", len(payload), ord(kind)) + payload
 
-    def number(value: float) -> tuple[str, bytes]:
-        if isinstance(value, int):
-            return "int32_t", struct.pack("<i", value)
-        return "float", struct.pack("<f", value)
+def parameter(name: str, value: float) -> bytes:
+    """The message (P) that states a parameter."""
+    if isinstance(value, int):
+        key = f"int32_t {name}".encode()
+        number = struct.pack("<i", value)
+    else:
+        key = f"float {name}".encode()
+        number = struct.pack("<f", value)
+    return message("P", bytes([len(key)]) + key + number)
 
-    def kind_of(fields: str) -> str:
-        if "esc" in fields:
-            return "i"
-        if "bool" in fields:
-            return "?"
-        return "f"
 
+def data(topic: int, fields: str, times: Array, rows: Array) -> list[bytes]:
+    """The messages (D) of a topic by its number; `fields` has its format."""
+    letter = "f"
+    if "esc" in fields:
+        letter = "i"
+        rows = rows.astype(int)
+    if "bool" in fields:
+        letter = "?"
+    parts = []
+    for t, row in zip(times, rows, strict=True):
+        stamp = struct.pack("<HQ", topic, round(1e6 * t))
+        parts.append(message("D", stamp + struct.pack(f"<{len(row)}{letter}", *row.tolist())))
+    return parts
+
+
+def ulog(path: Path, topics: Topics, formats: str = "", parameters: dict[str, float] | None = None) -> Path:
+    """Write a ULog.
+
+    Args:
+        path: where.
+        topics: by name, the format of their fields, times [s] and rows of numbers.
+        formats: of types that fields have, one a line.
+        parameters: numbers by name; a whole one is an int32_t.
+    """
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)]
     for line in formats.splitlines():
         parts.append(message("F", line.encode()))
     for name, (fields, _, _) in topics.items():
         parts.append(message("F", f"{name}:uint64_t timestamp;{fields}".encode()))
     for name, value in (parameters or {}).items():
-        kind, packed = number(value)
-        key = f"{kind} {name}".encode()
-        parts.append(message("P", bytes([len(key)]) + key + packed))
-    for i, name in enumerate(topics):
-        parts.append(message("A", struct.pack("<BH", 0, i) + name.encode()))
-    for i, (fields, times, rows) in enumerate(topics.values()):
-        kind = kind_of(fields)
-        for t, row in zip(times, rows, strict=True):
-            values = [int(value) for value in row] if kind == "i" else row.tolist()
-            stamp = struct.pack("<HQ", i, round(1e6 * t))
-            parts.append(message("D", stamp + struct.pack(f"<{len(row)}{kind}", *values)))
+        parts.append(parameter(name, value))
+    for number, name in enumerate(topics):
+        parts.append(message("A", struct.pack("<BH", 0, number) + name.encode()))
+    for number, (fields, times, rows) in enumerate(topics.values()):
+        parts += data(number, fields, times, rows)
     path.write_bytes(b"".join(parts))
     return path
 
 
+def rows_before(record: Record, t: Array) -> Any:
+    """The last rows before times; one at the time itself, but for rounding, is not before it."""
+    return np.searchsorted(record.t, t - 1e-4) - 1
+
+
+def commands_before(record: Record, t: Array) -> Array:
+    """The commands of the last rows before times."""
+    assert record.commands is not None
+    return record.commands[rows_before(record, t)]
+
+
 def px4_topics(record: Record) -> Topics:
-    """A record as PX4 logs it: NED, FRD, every topic at its own rate."""
+    """A record as PX4 logs it: NED, FRD, every topic at its own rate, the rates 1 ms after the sample."""
     down = z_down(record)
     assert down.position is not None
     assert down.commands is not None
@@ -566,7 +652,7 @@ def px4_topics(record: Record) -> Topics:
         "vehicle_angular_velocity": ("float[3] xyz;", down.t + 0.001, down.rates),
         "vehicle_attitude": ("float[4] q;", down.t, down.attitude),
         "vehicle_local_position": ("float x;float y;float z;float vx;float vy;float vz;", down.t[::2], local[::2]),
-        "actuator_motors": ("float[4] control;", down.t, down.commands / 838.0),
+        "actuator_motors": ("float[4] control;", down.t, down.commands / FULL),
         "battery_status": ("float voltage_v;", down.t[::100], np.full((8, 1), 11.5)),
     }
 
@@ -575,27 +661,27 @@ def test_ulog(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     """Its axes are turned into ours, its topics onto one clock, and it passes the checks."""
     record = read_record(ulog(tmp_path / "px4.ulg", px4_topics(eight)))
     inner = slice(10, 600)
-    at = np.searchsorted(eight.t, record.t[inner] - 1e-4) - 1
+    before = rows_before(eight, record.t[inner])
     assert record.throttle is not None
-    assert eight.commands is not None
-    np.testing.assert_allclose(record.throttle[inner], eight.commands[at] / 838.0, rtol=1e-5)
+    np.testing.assert_allclose(record.throttle[inner], commands_before(eight, record.t[inner]) / FULL, rtol=1e-5)
     for name in ("velocity", "attitude", "position"):
-        np.testing.assert_allclose(getattr(record, name)[inner], getattr(eight, name)[at], atol=0.2)
-    np.testing.assert_allclose(record.rates[inner], eight.rates[at], atol=1e-5)
+        np.testing.assert_allclose(getattr(record, name)[inner], getattr(eight, name)[before], atol=0.2)
+    np.testing.assert_allclose(record.rates[inner], eight.rates[before], atol=1e-5)
     assert record.voltage == pytest.approx(11.5)
     assert notes(record, hummingbird) == ()
 
 
 def test_ulog_with_outputs_and_speeds(tmp_path: Path, eight: Record) -> None:
+    """As old versions of PX4 log them: pulses from 1000 to 2000 us, whole rpm."""
     topics = px4_topics(eight)
     _, t, throttle = topics.pop("actuator_motors")
-    rpm = 838.0 * throttle * 60.0 / (2.0 * np.pi)
+    rpm = FULL * throttle * 60.0 / (2.0 * np.pi)
     topics["actuator_outputs"] = ("float[4] output;", t, 1000.0 + 1000.0 * throttle)
     topics["esc_status"] = ("esc_report[4] esc;", t, np.round(rpm))
     record = read_record(ulog(tmp_path / "old.ulg", topics, formats="esc_report:int32_t esc_rpm;"))
     assert record.throttle is not None
     assert record.speeds is not None
-    np.testing.assert_allclose(record.speeds, 838.0 * record.throttle, rtol=0.1)
+    np.testing.assert_allclose(record.speeds, FULL * record.throttle, rtol=0.1)
 
 
 def test_ulog_pulses_are_those_of_each_motor(tmp_path: Path, eight: Record) -> None:
@@ -613,9 +699,8 @@ def test_ulog_pulses_are_those_of_each_motor(tmp_path: Path, eight: Record) -> N
         stated[f"PWM_MAIN_MAX{output}"] = 1900
     record = read_record(ulog(tmp_path / "pwm.ulg", topics, parameters=stated))
     assert record.throttle is not None
-    assert eight.commands is not None
-    at = np.searchsorted(eight.t, record.t[50:600] - 1e-4) - 1
-    np.testing.assert_allclose(record.throttle[50:600], eight.commands[at] / 838.0, rtol=1e-5)
+    inner = slice(50, 600)
+    np.testing.assert_allclose(record.throttle[inner], commands_before(eight, record.t[inner]) / FULL, rtol=1e-5)
     np.testing.assert_array_equal(record.throttle[:10], 0.0)
 
 
@@ -629,8 +714,10 @@ def test_ulog_pulses_are_those_of_each_motor(tmp_path: Path, eight: Record) -> N
         ("PWM_MAIN_MIN", 2000),
     ],
 )
-def test_ulog_whose_pulses_say_nothing(tmp_path: Path, eight: Record, name: str, value: float) -> None:
-    """Where its throttle is logged as pulses; where it is logged as a share, they do not matter."""
+def test_impossible_pulses_of_a_ulog_are_refused_where_they_matter(
+    tmp_path: Path, eight: Record, name: str, value: float
+) -> None:
+    """Where its throttle is logged as pulses, and not where it is logged as a share."""
     topics = px4_topics(eight)
     assert read_record(ulog(tmp_path / "share.ulg", topics, parameters={name: value})).throttle is not None
     _, t, throttle = topics.pop("actuator_motors")
@@ -647,8 +734,10 @@ def test_rotors_of_a_ulog_that_are_no_number_are_refused(tmp_path: Path, eight: 
 
 
 @pytest.mark.representative("identification")
-def test_ulog_with_a_topic_without_time(tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]) -> None:
-    """It is left out, with a note; where it is needed, the refusal says so. Nothing is printed."""
+def test_a_topic_of_a_ulog_without_time_is_left_out_with_a_note_or_refused_where_it_is_needed(
+    tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its reader prints nothing."""
     path = ulog(tmp_path / "px4.ulg", px4_topics(eight))
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b"battery_status:uint64_t timestamp;", b"battery_status:uint64_t timestemp;"))
@@ -663,7 +752,7 @@ def test_ulog_with_a_topic_without_time(tmp_path: Path, eight: Record, capfd: py
 
 
 def test_ulog_knows_when_it_flies(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
-    """What is armed and not landed is flown; a log that never is says so."""
+    """While it is armed and has not landed; one that is never armed is refused."""
     topics = px4_topics(eight)
     topics["actuator_armed"] = ("bool armed;", np.array([0.0, 0.5, 7.8]), np.array([[False], [True], [False]]))
     topics["vehicle_land_detected"] = ("bool landed;", np.array([0.0, 1.0]), np.array([[True], [False]]))
@@ -676,40 +765,57 @@ def test_ulog_knows_when_it_flies(tmp_path: Path, eight: Record, hummingbird: Ve
         airborne_spans(parked, hummingbird)
 
 
-def test_accelerometer_fills_in_a_slow_velocity(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
-    """By default, PX4 logs its velocity at 10 Hz and its accelerometer at full rate; without velocity, that is all."""
-    eight = replace(eight, velocity=uniform_filter1d(eight.velocity, 9, axis=0))
-    topics = px4_topics(eight)
-    acceleration = np.gradient(eight.velocity, eight.t, axis=0) + np.array([0.0, 0.0, 9.81])
-    force = to_world(conjugate(eight.attitude), acceleration) * [1.0, -1.0, -1.0]
-    topics["sensor_combined"] = ("float[3] accelerometer_m_s2;", eight.t, force)
+@pytest.fixture(scope="module")
+def smooth(eight: Record) -> Record:
+    """`eight` with a velocity that is smooth enough to be differentiated."""
+    return replace(eight, velocity=uniform_filter1d(eight.velocity, 9, axis=0))
+
+
+def accelerometer(record: Record) -> tuple[str, Array, Array]:
+    """The topic of an accelerometer: the specific force in FRD, at full rate."""
+    without_gravity = np.gradient(record.velocity, record.t, axis=0) + np.array([0.0, 0.0, 9.81])
+    specific_force = to_world(conjugate(record.attitude), without_gravity)  # along the body's axes
+    return "float[3] accelerometer_m_s2;", record.t, specific_force * HALF_TURN
+
+
+def test_the_accelerometer_fills_in_a_slow_velocity(tmp_path: Path, smooth: Record) -> None:
+    """By default, PX4 logs its velocity at 10 Hz and its accelerometer at full rate."""
+    topics = px4_topics(smooth)
     fields, t, local = topics["vehicle_local_position"]
     topics["vehicle_local_position"] = (fields, t[::5], local[::5])
-    record = read_record(ulog(tmp_path / "slow.ulg", topics))
-    (note,) = record.notes
-    assert "the velocity is logged at 10 Hz" in note
-    del topics["sensor_combined"]
     alone = read_record(ulog(tmp_path / "alone.ulg", topics))
+    topics["sensor_combined"] = accelerometer(smooth)
+    filled = read_record(ulog(tmp_path / "slow.ulg", topics))
+    (note,) = filled.notes
+    assert "the velocity is logged at 10 Hz" in note
 
     def roughness(read: Record) -> float:
         """The deviation, from sample to sample, of the error of vx."""
         inner = slice(100, 600)
-        true = np.interp(read.t[inner], eight.t, eight.velocity[:, 0])
+        true = np.interp(read.t[inner], smooth.t, smooth.velocity[:, 0])
         return float(np.std(np.diff(true - read.velocity[inner, 0])))
 
-    assert roughness(record) < 0.6 * roughness(alone)
-    topics["sensor_combined"] = ("float[3] accelerometer_m_s2;", eight.t, force)
+    assert roughness(filled) < 0.6 * roughness(alone)
+
+
+def test_the_accelerometer_stands_in_for_a_velocity_that_is_not_logged(tmp_path: Path, smooth: Record) -> None:
+    topics = px4_topics(smooth)
+    topics["sensor_combined"] = accelerometer(smooth)
     del topics["vehicle_local_position"]
     assert read_record(ulog(tmp_path / "imu.ulg", topics)).inertial
 
 
 def test_advice_names_the_setting_of_the_autopilot(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    """For outputs that change every tenth sample, and that are logged every tenth."""
     topics = px4_topics(eight)
     fields, t, throttle = topics["actuator_motors"]
-    for rarely in ((t, np.repeat(throttle[::10], 10, axis=0)), (t[::10], throttle[::10])):
-        topics["actuator_motors"] = (fields, *rarely)
+    held = (fields, t, np.repeat(throttle[::10], 10, axis=0))
+    rare = (fields, t[::10], throttle[::10])
+    for topic in (held, rare):
+        topics["actuator_motors"] = topic
+        record = read_record(ulog(tmp_path / "default.ulg", topics))
         with pytest.raises(InputError, match=r"outputs change (9|10)\b.* log the outputs .*set SDLOG_PROFILE to 17"):
-            airborne_spans(read_record(ulog(tmp_path / "default.ulg", topics)), hummingbird)
+            airborne_spans(record, hummingbird)
 
 
 def test_rotors_that_a_ulog_states_are_offered_for_the_start(
@@ -724,15 +830,17 @@ def test_rotors_that_a_ulog_states_are_offered_for_the_start(
         stated |= {f"CA_ROTOR{i}_KM": 0.06 * turns[i]}
     path = ulog(tmp_path / "px4.ulg", px4_topics(eight), parameters=stated)
     assert main(["identify", str(path)]) == 2
-    (message,) = capsys.readouterr().err.splitlines()
-    tables = tomllib.loads("\n".join(message.partition("rotor_azimuths: ")[2].split("; ")))
-    hubs = [[x[i], -y[i], 0.05] for i in range(4)]
+    (line,) = capsys.readouterr().err.splitlines()
+    _, _, offered = line.partition("rotor_azimuths: ")
+    tables = tomllib.loads(offered.replace("; ", "\n"))
+    hubs = [[x[i], -y[i], 0.05] for i in range(4)]  # of FRD
     np.testing.assert_allclose(tables["rotor_positions"]["value"], hubs)
     assert tables["rotor_spins"]["value"] == [-1, -1, 1, 1]
     assert tables["drag_to_thrust"] == {"value": 0.06, "unit": "m", "source": "CA_ROTOR of px4.ulg"}
 
 
-def test_ulog_needs_its_topics_and_pyulog(tmp_path: Path, eight: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_topic_that_a_ulog_lacks_is_named(tmp_path: Path, eight: Record) -> None:
+    """With some of those that it has."""
     topics = px4_topics(eight)
     del topics["vehicle_attitude"]
     path = ulog(tmp_path / "short.ulg", topics)
@@ -741,8 +849,18 @@ def test_ulog_needs_its_topics_and_pyulog(tmp_path: Path, eight: Record, monkeyp
         match=r"lacks attitude: columns vehicle_attitude\.q\[0\].*; it has (actuator_motors|vehicle_|battery_)",
     ):
         read_record(path)
+
+
+def test_a_ulog_has_no_poles(tmp_path: Path, eight: Record) -> None:
+    path = ulog(tmp_path / "px4.ulg", px4_topics(eight))
     with pytest.raises(InputError, match="poles"):
-        read_record(ulog(tmp_path / "px4.ulg", px4_topics(eight)), poles=14)
+        read_record(path, poles=14)
+
+
+def test_a_ulog_without_pyulog_names_the_package(
+    tmp_path: Path, eight: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = ulog(tmp_path / "px4.ulg", px4_topics(eight))
     real = builtins.__import__
 
     def without(name: str, *arguments: Any) -> Any:
