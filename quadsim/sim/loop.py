@@ -156,10 +156,12 @@ class ClosedLoop:
             navigation.reset(plant.physics, initial_speeds, yaw=self._yaw)
         if ground is not None:
             ground.reset()
+
         if isinstance(reference, np.ndarray):
             reference = KnownReference(values=reference)
         if rng is None:
             rng = np.random.default_rng(0)
+
         self.k = 0
         self.period = steps_per_period * plant.timestep
         self.controller = controller
@@ -174,6 +176,7 @@ class ClosedLoop:
         self._loss_criterion: str | None = None
         self._interrupted = False
         self._traceback: tuple[str, ...] = ()
+
         self._plant = plant
         self._navigation = navigation
         self._ground = ground

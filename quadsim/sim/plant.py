@@ -135,11 +135,8 @@ class Plant:
             self._velocity = self._motion[_POSE:]
         else:
             self._compile(obstacles, limit_speeds=limit_speeds)
-        pushed = any(isinstance(change, PushChange) for change in changes)
-        self._has_forces = effects.follows_state or wind is not None or bool(self._user_forces) or pushed
-        self._has_forces = self._has_forces or bool(self._moving) or integrator == "rk4"
-        # Without a push, the core computes forces only if this is set.
-        self._computes_forces = self._has_forces
+        self._has_forces = self._can_have_forces(changes)
+        self._computes_forces = self._has_forces  # in the core, in every step; a push needs them while it acts
         if integrator == "rk4":  # it adds disturbances and the user's forces without computing others
             self._computes_forces = replace(effects, disturbance=None).follows_state
         self._steps_type = steps_type(
@@ -176,6 +173,14 @@ class Plant:
         self._motion = self._data.qpos
         self._velocity = self._data.qvel
         mujoco.set_mju_user_warning(_discard)
+
+    def _can_have_forces(self, changes: Sequence[Change]) -> bool:
+        """Return whether forces other than the rotors' thrust may act, so that physics steps have a wrench."""
+        if self._integrator == "rk4" or self._wind is not None or self._user_forces or self._moving:
+            return True
+        if any(isinstance(change, PushChange) for change in changes):
+            return True
+        return self.effects.follows_state
 
     def __enter__(self) -> Plant:
         return self
