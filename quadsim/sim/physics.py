@@ -411,7 +411,7 @@ def plant_log(steps: PhysicsSteps, rotors: Array, start: Array, yaw: float, time
 
 
 def _at_instants(values: Array) -> Array:
-    """Return what acts during M steps as M + 1 rows: at each step's start, and at the end again that of the last step."""
+    """Return what acts during M steps as M + 1 rows: one at each step's start, and the last one again at the end."""
     return np.append(values, values[-1:], axis=0)
 
 
