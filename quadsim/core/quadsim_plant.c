@@ -74,8 +74,7 @@ static double follow_target(const quadsim_vehicle *v, double speed, double targe
     return target - sign * eased * decay;
 }
 
-/* Turn the rotors for a step towards their targets; return their speeds at its start and midway, and the slope there.
- */
+/* Turn the rotors for a step towards their targets; give their speeds at its start and midway, and the slopes there. */
 static void turn_rotors(quadsim_vehicle *v, double *at_start, double *midway, double *slope)
 {
     double unused;
@@ -129,7 +128,7 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
     return pow(voltage / v->reference_voltage, v->exponent);
 }
 
-/* A thrust less the share of the largest one that is lost, which a standard normal number draws. */
+/* A thrust less a random loss, which is a share of the largest thrust; `draw` is a standard normal number. */
 static double noisy_thrust(const quadsim_vehicle *v, double thrust, double largest, double draw)
 {
     const double share = thrust / largest;
@@ -236,7 +235,7 @@ static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double h
 }
 
 /* Add what the hubs' height z adds to drag and moment of the rotors: where the body turns, the hubs move by rate x z.
- * `along` is the velocity through the air along the body's axes. */
+ * `along` is the velocity through the air, body frame. */
 static void add_hub_height(const quadsim_vehicle *v, double R[3][3], const double *along, const double *rate,
                            const double *speed, double *wrench)
 {
@@ -275,9 +274,7 @@ static void add_inflow(const quadsim_vehicle *v, double R[3][3], double climbing
     }
 }
 
-/* Add the drag of the rotors in the plane of their discs; `along` is the velocity through the air along the body's
- * axes.
- */
+/* Add the drag of the rotors in the plane of their discs; `along` is the velocity through the air, body frame. */
 static void add_rotor_drag(const rotor_state *rotors, double R[3][3], const double *along, const double *rate,
                            double *wrench)
 {
@@ -296,7 +293,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
     const double *rate = velocity + 3;
     double R[3][3];
     double air[3];   /* velocity through the air, world */
-    double along[3]; /* and along the body's axes */
+    double along[3]; /* the same, body frame */
     double drag[3];
     to_matrix(pose + 3, R);
     for (int i = 0; i < 3; i++) {

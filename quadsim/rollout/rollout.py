@@ -118,10 +118,10 @@ def _check_parts(assembly: Assembly, controller: Controller) -> None:
 def _restoring_working_directory() -> Iterator[None]:
     """Return to the working directory at the end, even if it has been removed in between.
 
-    User code may change it.  It is kept open, rather than its path, because a removed folder has no path.
+    User code may change it.  The folder is kept open, because a path does not lead back to one that has been removed.
     """
-    without_read_permission = getattr(os, "O_PATH", os.O_RDONLY)
-    directory = os.open(os.curdir, without_read_permission)
+    flags = getattr(os, "O_PATH", os.O_RDONLY)  # O_PATH, where it exists, needs no permission to read the folder
+    directory = os.open(os.curdir, flags)
     try:
         yield
     finally:

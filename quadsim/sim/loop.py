@@ -505,14 +505,10 @@ class ClosedLoop:
             return
         with _ending_flight(plant.time):
             active = self._active_inner
-            takes_over = active is None or active.inner is not inner
-            if active is None or takes_over:
+            if active is None or active.inner is not inner:
                 active = _ActiveInnerLoop(inner, inner_steps(inner.rate, plant.timestep))
                 self._active_inner = active
             struct = active.engage(hold.command, plant.speeds)
-        struct.stride = active.stride
-        if takes_over:
-            struct.until = 0
         measured = None
         if active.measures:
             measured = self._navigation
@@ -573,7 +569,7 @@ class _CommandsUnderWay:
         steps = self._steps_per_period
         arrival = self._steps_into_period(delay)
         missed = arrival > steps  # one that comes just in time is in force from the next period on
-        end = min(arrival, steps)  # of what is in force before it
+        end = min(arrival, steps)  # where what is in force before it ends
         plan_start = end
         if computation is not None and computation.plan:
             plan_start = min(end, self._steps_into_period(computation.delay))
@@ -603,14 +599,14 @@ class _ActiveInnerLoop:
 
     Attributes:
         inner: the inner loop.
-        stride: physics steps between its answers.
         measures: whether it receives sensors' samples, as an autopilot does; else the true attitude and rates.
     """
 
     def __init__(self, inner: InnerLoop, stride: int) -> None:
         self.inner = inner
-        self.stride = stride
         self.measures = takes_targets(inner)
+        self._stride = stride  # physics steps between answers
+        self._has_answered = False
         self._outside = InnerStruct()  # for the core where `inner` answers in Python
         self._engage: Callable[[Array, Array], Struct | None] | None = None
         if isinstance(inner, Engaging):
@@ -618,9 +614,16 @@ class _ActiveInnerLoop:
 
     def engage(self, command: Array, rotors: Array) -> Struct:
         """Put a command in force at rotor speeds (4,) [rad/s]; return the struct by which the core flies it."""
-        if self._engage is None:
-            return self._outside
-        return self._engage(command, rotors) or self._outside
+        struct = None
+        if self._engage is not None:
+            struct = self._engage(command, rotors)
+        if struct is None:
+            struct = self._outside
+        struct.stride = self._stride
+        if not self._has_answered:
+            struct.until = 0  # the first answer is due at once
+            self._has_answered = True
+        return struct
 
 
 def fly(

@@ -145,7 +145,7 @@ class Plant:
         self._changes = self._scheduled(changes)
         if rng is None:
             rng = np.random.default_rng(0)
-        self._last_reset = b""  # the state (12,) of the last reset, and the motion (13,) that it is
+        self._last_reset = b""  # the bytes of the state (12,) of the last reset, and the same as a motion (13,)
         self._last_motion = np.zeros(_MOTION)
         self._seed(rng)
         self._struct = self._make_struct()
