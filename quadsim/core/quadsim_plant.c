@@ -26,6 +26,9 @@
 /* Lowest height of a rotor, in radii, at which the ground effect grows. */
 static const double LOWEST_HEIGHT_RATIO = 0.5;
 
+/* Where the parts of a motion start, which kinds of sensors measure. */
+static const int START[SENSORS] = {[POSITION] = 0, [ATTITUDE] = 3, [VELOCITY] = 7, [RATES] = 10};
+
 /* What the rotors of a step give, whatever the motion; sums over the rotors that have a propeller. */
 typedef struct {
     double thrust[ROTORS];
@@ -401,15 +404,16 @@ static void angular_acceleration(const quadsim_vehicle *v, const double *w, cons
 static void motion_slope(const quadsim_vehicle *v, const double *x, const rotor_state *rotors, const double *wind,
                          const double *held, double *wrench, double *slope)
 {
-    const double *q = x + 3, *velocity = x + 7, *w = x + 10;
+    const double *q = x + START[ATTITUDE], *velocity = x + START[VELOCITY], *w = x + START[RATES];
     const double *T = rotors->thrust;
     const double lift = T[0] + T[1] + T[2] + T[3];
+    double *acceleration = slope + START[VELOCITY];
     double torque[3], axis[3];
     memset(wrench, 0, WRENCH * sizeof *wrench);
     if (v->follows_motion) {
         forces_at(v, x, velocity, rotors, wind, wrench);
     }
-    quaternion_rate(q, w, slope + 3);
+    quaternion_rate(q, w, slope + START[ATTITUDE]);
     thrust_axis(q, axis);
     for (int i = 0; i < 3; i++) {
         const double *row = v->torque_of_thrust[i];
@@ -417,10 +421,10 @@ static void motion_slope(const quadsim_vehicle *v, const double *x, const rotor_
         const double force = wrench[i] + held[i];
         torque[i] = of_thrust + (wrench[3 + i] + held[3 + i]);
         slope[i] = velocity[i];
-        slope[7 + i] = (axis[i] * lift + force) / v->mass;
+        acceleration[i] = (axis[i] * lift + force) / v->mass;
     }
-    slope[9] -= v->gravity;
-    angular_acceleration(v, w, torque, slope + 10);
+    acceleration[2] -= v->gravity;
+    angular_acceleration(v, w, torque, slope + START[RATES]);
 }
 
 static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, const double *wind,
@@ -441,10 +445,10 @@ static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, cons
     for (int i = 0; i < MOTION; i++) {
         v->motion[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
     }
-    const double *q = v->motion + 3;
+    double *q = v->motion + START[ATTITUDE];
     const double norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    for (int i = 3; i < 7; i++) {
-        v->motion[i] /= norm;
+    for (int i = 0; i < 4; i++) {
+        q[i] /= norm;
     }
     for (int i = 0; i < WRENCH; i++) {
         wrench[i] = held[i] + (acted[0][i] + 2.0 * acted[1][i] + 2.0 * acted[2][i] + acted[3][i]) / 6.0;
@@ -453,20 +457,18 @@ static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, cons
 
 /* ---- sensors ----------------------------------------------------------------------------------------------------- */
 
-/* Where the quantity of a kind of sensor starts in the motion: position, velocity, attitude, rates. */
-static const int COLUMN[SENSORS] = {0, 7, 3, 10};
-
+/* Copy the motion (13), which MuJoCo keeps in two arrays. */
 static void motion_of(const quadsim_vehicle *v, double *motion)
 {
     memcpy(motion, v->motion, 7 * sizeof *motion);
-    memcpy(motion + 7, v->velocity, 6 * sizeof *motion);
+    memcpy(motion + START[VELOCITY], v->velocity, 6 * sizeof *motion);
 }
 
 /* Take sample j: what stands in its place is its error, which the sample replaces. */
 static void take_sample(quadsim_sensor *s, int64_t j, const double *motion)
 {
     double *value = s->values + 3 * (j - s->first);
-    const double *truth = motion + COLUMN[s->kind];
+    const double *truth = motion + START[s->kind];
     const int fate = s->fate[j - s->first];
     if (s->kind == ATTITUDE) { /* the error is a rotation vector, the sample Euler angles */
         double q[4];
@@ -528,8 +530,8 @@ static void hold_newest(quadsim_sensor *s, int64_t now)
 void quadsim_hear(quadsim_sensing *sensed, int64_t now, const double *motion)
 {
     double attitude[4], rates[3];
-    memcpy(attitude, motion + 3, sizeof attitude);
-    memcpy(rates, motion + 10, sizeof rates);
+    memcpy(attitude, motion + START[ATTITUDE], sizeof attitude);
+    memcpy(rates, motion + START[RATES], sizeof rates);
     for (int64_t k = 0; k < sensed->count; k++) {
         quadsim_sensor *s = sensed->sensors + k;
         hold_newest(s, now);
@@ -554,7 +556,8 @@ void quadsim_hear(quadsim_sensing *sensed, int64_t now, const double *motion)
 static int64_t answer_if_due(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed)
 {
     if (loop->until == 0) {
-        const double *attitude = v->motion + 3, *rates = v->velocity + 3;
+        const double *attitude = v->motion + START[ATTITUDE];
+        const double *rates = v->velocity + 3;
         if (loop->kind == OUTSIDE) {
             return QUADSIM_DUE;
         }
@@ -682,16 +685,18 @@ void quadsim_euler_rates(const double *euler, const double *rate, double *rates)
 
 void quadsim_observe(const double *physics, double *last, double *upright, double *state)
 {
+    const double *motion = physics + 1; /* after the time */
+    const double *position = motion + START[POSITION], *velocity = motion + START[VELOCITY];
     double euler[3], rates[3];
-    to_euler(physics + 4, euler);
-    quadsim_euler_rates(euler, physics + 11, rates);
+    to_euler(motion + START[ATTITUDE], euler);
+    quadsim_euler_rates(euler, motion + START[RATES], rates);
     if (isfinite(euler[0] + euler[1] + euler[2])) {
         quadsim_turn(euler, last, upright);
         euler[2] = *last;
     }
     for (int i = 0; i < 3; i++) {
-        state[2 * i] = physics[1 + i];
-        state[2 * i + 1] = physics[8 + i];
+        state[2 * i] = position[i];
+        state[2 * i + 1] = velocity[i];
         state[6 + 2 * i] = euler[i];
         state[7 + 2 * i] = rates[i];
     }

@@ -324,11 +324,11 @@ class Rollout:
         """The compiled controller that can fly this scenario in the core alone (`fly_in_core`).
 
         None where the flight needs Python in between: for events of controller or set-point, for code of the user, for
-        what only the loop attends to, or for a controller that the core does not have.
+        computing time, ground or obstacles, or for a controller that the core does not have.
         """
         scenario = self.scenario
         controller = self.loop.controller
-        if self._has_user_code or scenario.forces or self.loop.attends or needs_quaternions(scenario):
+        if self._has_user_code or scenario.forces or self.loop.beyond_core or needs_quaternions(scenario):
             return None
         if any(isinstance(event, SetpointEvent | ControllerEvent) for event in scenario.events):
             return None

@@ -198,8 +198,8 @@ class ClosedLoop:
         self._switched_at = 0  # the first period of this controller
 
     @property
-    def attends(self) -> bool:
-        """Whether periods depend on computing time, on the ground or on obstacles, which only this loop attends to."""
+    def beyond_core(self) -> bool:
+        """Whether periods depend on computing time, on the ground or on obstacles, which `core_loop` leaves out."""
         return self.computation is not None or self._ground is not None
 
     @property

@@ -189,7 +189,7 @@ class Plant:
         self.close()
 
     def close(self) -> None:
-        """Free native memory; the plant cannot fly on."""
+        """Free native memory, with all arrays that refer to it; the plant cannot fly on."""
         for name in ("_struct", "_data", "model", "_motion", "_velocity"):
             self.__dict__.pop(name, None)
 
@@ -393,7 +393,10 @@ class Plant:
         return self.flown
 
     def begin(self, steps: int) -> None:
-        """Begin a period of M physics steps: `hold` fills its rows."""
+        """Begin a period of M physics steps, whose rows `hold` fills.
+
+        The core receives the address of each column of the rows in their first row, and the width of a row.
+        """
         flown = np.empty(steps, self._steps_type)
         rows = StepsStruct()
         start = flown.ctypes.data
