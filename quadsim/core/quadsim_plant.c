@@ -435,10 +435,11 @@ static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, cons
     const double *held = disturbance ? disturbance : ZERO;
     double k[4][MOTION], acted[4][WRENCH], x[MOTION];
     memcpy(x, v->motion, sizeof x);
-    motion_slope(v, x, rotors, wind, held, acted[0], k[0]);
-    for (int stage = 1; stage < 4; stage++) {
-        for (int i = 0; i < MOTION; i++) {
-            x[i] = v->motion[i] + STAGE_TIME[stage] * h * k[stage - 1][i];
+    for (int stage = 0; stage < 4; stage++) {
+        if (stage > 0) {
+            for (int i = 0; i < MOTION; i++) {
+                x[i] = v->motion[i] + STAGE_TIME[stage] * h * k[stage - 1][i];
+            }
         }
         motion_slope(v, x, rotors, wind, held, acted[stage], k[stage]);
     }
