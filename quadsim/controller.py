@@ -22,32 +22,51 @@ from quadsim.vehicle import LARGEST
 if TYPE_CHECKING:
     from quadsim.core.mirror import Struct
 
-SOLVED: Final = "solved"  # status: a QP solver or the core computed the optimum
+# ---- statuses of a command -------------------------------------------------------------------------------------------
+
+SOLVED: Final = "solved"
+"""A QP solver or the core computed the optimum."""
 UNCONSTRAINED: Final = "unconstrained"
-"""Status: the unconstrained optimum satisfies every constraint, so it is also the constrained optimum."""
-COMMANDED: Final = "commanded"  # status: command of a controller without a solver
+"""The unconstrained optimum satisfies every constraint, so it is also the constrained optimum."""
+COMMANDED: Final = "commanded"
+"""The command is of a controller without a solver."""
 NOT_CONVERGED: Final = "not_converged"
-"""Status: the QP was solved, but its plan does not satisfy the nonlinear dynamics that it linearises."""
-OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # statuses whose command is the controller's answer
-ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # statuses whose command is applied unchanged
+"""The QP was solved, but its plan does not satisfy the nonlinear dynamics that it linearises."""
 MISSED: Final = "missed"
-"""Status: the command arrived after the start of the next period, so the one before stayed in force."""
-GAIN: Final = "gain"  # source of a command: the unconstrained optimum, a product with constant gains
-CORE: Final = "core"  # the exact optimum of `quadsim.mpc.solvers.core`, compiled
-LAW: Final = "law"  # a controller without a solver
-FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
-STOPPED: Final = "stopped"  # no source: the rotors are off
+"""The command arrived after the start of the next period, so the one before stayed in force."""
+OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})
+"""Statuses whose command is the controller's answer."""
+ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}
+"""Statuses whose command is applied unchanged."""
+
+# ---- sources of a command, beside QP solvers by their names (`quadsim.mpc.solvers.find_solver`) ----------------------
+
+GAIN: Final = "gain"
+"""The unconstrained optimum, a product with constant gains."""
+CORE: Final = "core"
+"""The exact optimum of `quadsim.mpc.solvers.core`, compiled."""
+LAW: Final = "law"
+"""A controller without a solver."""
+FALLBACK: Final = "fallback"
+"""An earlier plan or command, or the fallback contract."""
+STOPPED: Final = "stopped"
+"""None: the rotors are off."""
 NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
 """Sources of a command without an optimum, for which no active constraints and no computing time are reported."""
 NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
-"""Sources of a command other than QP solvers, which are recorded by name (`quadsim.mpc.solvers.find_solver`)."""
+"""Sources of a command other than QP solvers."""
+
+# ---- what a controller commands, its attribute or field `commands` ---------------------------------------------------
+
 ROTORS: Final = "rotors"
-"""Commands of rotor speeds; others are targets of an autopilot."""
+"""Rotor speeds (4,) [rad/s]; the other commands are targets of an autopilot."""
 RATES: Final = "rates"
 """Targets (4,): collective thrust T [N] and body rates p, q, r [rad/s]."""
 ATTITUDE: Final = "attitude"
 """Targets (8,): collective thrust T [N], body rates p, q, r [rad/s] that are fed forward, and the attitude to hold, a
 quaternion w, x, y, z, body to world."""
+TARGET_SIZES: Final = {ROTORS: 4, RATES: 4, ATTITUDE: 8}
+"""The number of numbers in a command."""
 COMMANDED_NUMBERS: Final = {
     ROTORS: "four rotor speeds [rad/s]",
     RATES: "T, p, q, r: collective thrust [N] and body rates [rad/s]",
@@ -56,11 +75,9 @@ COMMANDED_NUMBERS: Final = {
         "unit quaternion from body to world"
     ),
 }
-"""What a controller commands (its attribute or field `commands`), in words."""
-TARGET_SIZES: Final = {ROTORS: 4, RATES: 4, ATTITUDE: 8}
-"""What a controller commands (its attribute or field `commands`), and the numbers in a command."""
+"""These numbers in words."""
 LARGEST_SPEED: Final = LARGEST
-"""Largest magnitude of a valid rotor speed command [rad/s], that of a vehicle's numbers; a larger one is a fault."""
+"""Largest magnitude of a valid rotor speed command [rad/s], as of any number of a vehicle; a larger one is a fault."""
 
 
 class Signals(Protocol):
@@ -87,14 +104,14 @@ class StepInputs:
     Attributes:
         time: t_k [s].
         phase: phase relative to the ground.
-        acting: (4,) the command before, u(k-1) [rad/s], in force at t_k unless commands take longer than a period to
-            act; None if it is the controller's last command.
+        acting: (4,) the command before, u(k-1) [rad/s].  It is in force at t_k unless commands take longer than a
+            period to act.  None: the controller takes its own last command for it.
         attitude: (4,) measured quaternion wxyz, body to world, sign continuous from period to period; None: derive it
             from the state.
         body_rates: (3,) measured body rates [rad/s]; None: derive them from the state.
         motion: the reference from t_k on, if the course defines more than x, y, z, yaw.
-        unseen: (12,) periods since each channel of the state was measured, where the fallback contract has predicted
-            those that are missing; None: all are measured now.
+        unseen: (12,) periods since each entry of the state was measured: the fallback contract predicts entries that
+            are missing.  None: all are measured now.
         signals: recorder for `log`; None if nothing is recorded.
 
     Examples:
@@ -122,8 +139,8 @@ class StepInputs:
         """Record a number of this period: a column of flight.parquet, and `flight.logged[name]`.
 
         Args:
-            name: an identifier that is not a column of flight.parquet; of several values in a period the last counts.
-            value: a finite number, or NaN (used for periods without a value).
+            name: an identifier that is not a column of flight.parquet.  Of several values in a period the last counts.
+            value: a finite number, or NaN, which also stands in periods without a value.
             unit: stored with the column.
 
         Raises:
@@ -136,12 +153,15 @@ class StepInputs:
 class InnerLoop(Protocol):
     """A faster loop inside the control period, from the command in force to the rotor speeds applied.
 
-    An autopilot `takes_targets` instead (`AutopilotLoop`).
+    An autopilot is one whose commands are targets instead of rotor speeds (`AutopilotLoop`).
     """
 
     @property
     def rate(self) -> float:
-        """Rate of calls [Hz], a whole number of physics steps apart, from when it comes into force."""
+        """Rate of calls [Hz], of which the first is when the loop comes into force.
+
+        The time between two calls is a whole number of physics steps.
+        """
         ...
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
@@ -150,20 +170,20 @@ class InnerLoop(Protocol):
         Args:
             time: [s].
             commanded: the command in force: rotor speeds (4,) [rad/s], or a target.
-            rates: (3,) body rates [rad/s]: true, or for an autopilot those of the sensor, if there is one.
-            rotors: (4,) rotor speeds [rad/s].
-            attitude: (4,) quaternion wxyz, body to world, likewise.
+            rates: (3,) body rates [rad/s]: the true ones, or for an autopilot with a sensor the measured ones.
+            rotors: (4,) true rotor speeds [rad/s].
+            attitude: (4,) quaternion wxyz, body to world: true or measured, as the rates.
         """
         ...
 
 
 @runtime_checkable
 class TargetLoop(Protocol):
-    """What an inner loop may say: that its commands are targets, not rotor speeds; see `quadsim.sim.autopilot`."""
+    """An inner loop that says whether its commands are targets; see `quadsim.sim.autopilot`."""
 
     @property
     def takes_targets(self) -> bool:
-        """Whether they are."""
+        """Whether its commands are targets, not rotor speeds."""
         ...
 
 
@@ -194,10 +214,10 @@ class Engaging(Protocol):
     """An inner loop that the compiled core may answer for."""
 
     def engage(self, command: Array, rotors: Array) -> Struct | None:
-        """Let a command fly from now on, at rotor speeds (4,) [rad/s].
+        """Put a command in force, at rotor speeds (4,) [rad/s].
 
         Returns:
-            the struct that answers in the core; None where `speeds` is to be asked.
+            the struct with which the core computes the answers; None: they come from `speeds`.
         """
         ...
 
@@ -255,10 +275,10 @@ class Command:
         status: `solved`, `unconstrained`, `commanded` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where
             rotors are stopped, or the solver's name for its failure.
         answered_by: source of `speeds`: `gain`, `core`, a QP solver by its name, `law`, `fallback` or `stopped`.
-        fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan, or
-            the last command, if it continues for one that missed its deadline.
+        fallback: 0 when `speeds` is this period's optimum.  1: the shifted previous plan, or the last command, which
+            stays in force where one misses its deadline.  Higher levels: see the fallback contract.
         stats: how it was computed.
-        inner: inner loop that flies commands from now on; None: the rotors hold `speeds`.
+        inner: the inner loop that flies this command; None: the rotors hold `speeds`.
         iterations_by: whose iterations `stats` counts, also if that answer was rejected; empty: `answered_by`.
 
     Examples:
@@ -314,7 +334,7 @@ class Iterating(Protocol):
 
     @property
     def iterates(self) -> frozenset[str]:
-        """Names of all that may count them, as in `Command.iterations_by`."""
+        """Names of the solvers that may count them, as in `Command.iterations_by`."""
         ...
 
 
@@ -346,9 +366,8 @@ class Stepping(Protocol):
 class Controller(Named, Solving, Resetting, Stepping, Protocol):
     """What is asked for a command once per control period.
 
-    These are the parts that every controller has.  Those that it may have are the protocols below: a controller has
-    one by having its member.  A user's controller need only be `Stepping`; `quadsim.scenarios.plugin` makes it a
-    controller.
+    These are the members that every controller has.  The protocols below are optional: a controller follows one by
+    having its member.  A user's controller need only be `Stepping`; `quadsim.scenarios.plugin` adds the rest.
     """
 
     @property
@@ -362,9 +381,9 @@ class Predicting(Protocol):
     """A controller with a model; without one, the run has no `horizon.parquet`."""
 
     def predict(self, states: Array, plans: Array) -> Array | None:
-        """Return the predicted states (K, N, 12) from K measured states (K, 12) and plans (K, N, 4), for pictures.
+        """Return the states (K, N, 12) predicted from measured states (K, 12) and plans (K, N, 4), for figures.
 
-        None where there is no model after all, as where a controller without one is wrapped.
+        None: there is no model.  So a wrapper answers whose controller has none.
         """
         ...
 
@@ -389,7 +408,7 @@ class Adopting(Protocol):
 
 @runtime_checkable
 class Beginning(Protocol):
-    """A controller that wants to know how the vehicle turns when it begins."""
+    """A controller that needs the body rates at its start."""
 
     def begin(self, rates: Array) -> None:
         """Begin at body rates (3,) [rad/s]; called after `reset`."""
@@ -398,18 +417,18 @@ class Beginning(Protocol):
 
 @runtime_checkable
 class Diagnosable(Protocol):
-    """A controller that keeps its first problem without an answer."""
+    """A controller that keeps the first problem for which it found no answer."""
 
     @property
     def infeasible_period(self) -> object:
-        """An `quadsim.mpc.InfeasiblePeriod`, of the first such period since `reset`; None if there is none."""
+        """The `quadsim.mpc.InfeasiblePeriod` of the first such period since `reset`; None if there is none."""
         ...
 
 
 class CoreController(Protocol):
-    """A controller and what guards it in the core, which answers each period in one call.
+    """A controller and its fallback contract in the core, which answers each period in one call.
 
-    It flies as long as every period has an optimum; other periods are the controller's that it was made of.
+    It flies as long as every period has an optimum.  For any other flight, use the controller that it was made of.
     """
 
     @property
@@ -429,7 +448,7 @@ class CoreController(Protocol):
 
     @property
     def statistics(self) -> Mapping[str, Array]:
-        """(K,) of the periods so far, by the names of `Statistics`, of those that there are."""
+        """Columns (K,) of the periods so far, by the names of `Statistics`; the core has not all of them."""
         ...
 
     @property
@@ -442,7 +461,7 @@ class CoreController(Protocol):
         ...
 
     def step(self, state: int, reference: int) -> bool:
-        """Answer the next period, in the air; return whether it has an optimum.
+        """Answer the next period, in which the vehicle flies; return whether there is an optimum.
 
         Args:
             state: address of the measured state (12,).
@@ -456,7 +475,10 @@ class InCore(Protocol):
     """A controller that the core can fly alone."""
 
     def in_core(self, fallback: Struct) -> CoreController | None:
-        """Return it with a fallback contract of these numbers (`quadsim_fallback`); None where it cannot."""
+        """Return the controller for the core, with the settings of its fallback contract, a `quadsim_fallback`.
+
+        None: the core cannot fly it.
+        """
         ...
 
 
@@ -471,12 +493,12 @@ class Commanding(Protocol):
 
 
 def check_command(speeds: Array) -> str | None:
-    """Return why rotor speeds are not a valid command, or None."""
+    """Return why rotor speeds are not a valid command; None if they are."""
     if np.iscomplexobj(speeds):
         return f"the command has complex numbers: {np.asarray(speeds).tolist()}"
     if np.shape(speeds) != (4,):
         return f"the command has shape {np.shape(speeds)}, not (4,)"
-    if np.abs(speeds).max() <= LARGEST_SPEED:  # False for NaN
+    if np.abs(speeds).max() <= LARGEST_SPEED:  # False if one is NaN
         return None
     if not np.all(np.isfinite(speeds)):
         return f"the command is not finite: {np.asarray(speeds).tolist()}"
@@ -484,17 +506,17 @@ def check_command(speeds: Array) -> str | None:
 
 
 def counts(answered_by: Mapping[str, int]) -> str:
-    """Return the number of periods per source, largest first.
+    """Describe the number of periods per source of the command, largest first.
 
     For example `607 periods at the unconstrained optimum, no QP; 593 by piqp-multistage`, or `280 periods commanded`.
     """
     texts = {GAIN: "at the unconstrained optimum, no QP", LAW: COMMANDED}
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
     parts: list[str] = []
-    for by, count in ranked:
+    for source, count in ranked:
         periods = f"{count}"
         if not parts:
             periods = f"{count} periods"
-        source = texts.get(by, f"by {by}")
-        parts.append(f"{periods} {source}")
+        text = texts.get(source, f"by {source}")
+        parts.append(f"{periods} {text}")
     return "; ".join(parts)

@@ -4,7 +4,7 @@ The state vector is xi = [x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw
 velocities in the world frame (z up), attitude as Z-Y-X Euler angles (body_to_world = Rz(yaw) Ry(pitch) Rx(roll)),
 and **Euler-angle rates**, not body rates; `quadsim.rotation` converts between them.
 
-A yaw counts its turns, an error of it does not: it is `wrapped` to (-pi, pi].
+A yaw is not limited to one turn: after a whole turn it is 2 pi.  A difference of yaws is `wrapped` to (-pi, pi].
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ ANGLES: Final = slice(6, 12, 2)
 ANGLE_RATES: Final = slice(7, 12, 2)
 """The same entries as slices, which NumPy indexes in a fifth of the time."""
 
+# The unit that is shown for an SI unit, and the factor to it; other units are shown as they are.
 _SHOWN: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 
 REFERENCE_NAMES: Final = ("x", "y", "z", "yaw")
@@ -54,7 +55,7 @@ def shown_unit(unit: str) -> tuple[str, float]:
 
 
 def tilt(states: Array) -> Array:
-    """(M,) angle between the thrust axis and the vertical [rad] of states (M, 12)."""
+    """Return the angle (M,) between thrust axis and vertical [rad] of states (M, 12)."""
     cosine = np.cos(states[:, INDEX["roll"]]) * np.cos(states[:, INDEX["pitch"]])
     angle: Array = np.arccos(np.clip(cosine, -1.0, 1.0))
     return angle
@@ -92,7 +93,7 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
         return part
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
-        """What NumPy makes of a result: as of any array."""
+        """Return a result of NumPy as a plain array, or as a scalar where it makes one."""
         if return_scalar:
             return array[()]
         return array.view(np.ndarray)
@@ -100,19 +101,21 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
 
 _Angle = TypeVar("_Angle", float, Array)
 TURN: Final = 2.0 * math.pi
-_TIE: Final = 1e-6  # [turns] this close to -1/2 turn counts as +1/2
+_TIE: Final = 1e-6  # [turns] an angle this close to -1/2 turn counts as +1/2 turn, so that rounding does not decide
 KEPT: Final = math.radians(190.0)
 """Distance from the vehicle's yaw up to which a reference keeps its turn [rad]; see `ReferenceTurns`."""
 
 
 def wrapped(angle: _Angle) -> _Angle:
     """Wrap a difference of angles to (-pi, pi] [rad]."""
-    return math.pi - (math.pi - angle) % TURN % TURN  # the first remainder of a tiny negative number rounds to TURN
+    # The second remainder is for a tiny negative number, whose first remainder rounds to TURN itself.
+    return math.pi - (math.pi - angle) % TURN % TURN
 
 
 def whole_turns(angle: _Angle, turn: float = TURN) -> _Angle:
-    """The whole turns n for which angle - n turn is in (-turn / 2, turn / 2], up to rounding."""
-    return -((0.5 + _TIE - angle / turn) // 1.0)
+    """Return the whole turns n for which angle - n turn is in (-turn / 2, turn / 2], up to rounding."""
+    turns = angle / turn
+    return -((0.5 + _TIE - turns) // 1.0)  # the ceiling of turns - 1/2
 
 
 def nearest_turn(angle: _Angle, to: float = 0.0, turn: float = TURN) -> _Angle:
@@ -121,23 +124,28 @@ def nearest_turn(angle: _Angle, to: float = 0.0, turn: float = TURN) -> _Angle:
 
 
 def unwrapped(angles: Array, before: float) -> Array:
-    """Change angles (K,) by whole turns to those nearest the angle before each; themselves where they are already."""
+    """Change each of the angles (K,) by whole turns to be nearest the one before it; the first to `before`.
+
+    Where nothing changes, the same array is returned.
+    """
     steps = np.empty_like(angles)
-    steps[:1] = angles[:1] - before
+    steps[:1] = angles[:1] - before  # an empty slice of no angles
     np.subtract(angles[1:], angles[:-1], out=steps[1:])
     turns = whole_turns(steps)
-    if np.count_nonzero(turns):
-        return angles - TURN * turns.cumsum()
-    return angles
+    if np.count_nonzero(turns) == 0:
+        return angles
+    return angles - TURN * turns.cumsum()
 
 
 class ReferenceTurns:
-    """Changes the yaw of a reference by whole turns, to the turn of the vehicle's yaw.
+    """Changes the yaw of a reference by whole turns, so that a vehicle does not turn the long way round.
 
-    A flight's first sample is at most half a turn from the vehicle (error: vehicle less reference), each later one at
-    most half a turn from the one before, within a preview and from period to period.  Only where the vehicle is more
-    than `KEPT` from the reference does this start from the vehicle again: half a turn away, noise does not decide anew
-    in every period which way round is the shorter.
+    - The first reference of a flight starts at most half a turn from the vehicle's yaw.
+    - Each later sample is at most half a turn from the one before, within a preview and from period to period.
+    - Where the vehicle is more than `KEPT` from the reference, it starts at most half a turn from the vehicle again.
+
+    `KEPT` is more than half a turn.  At half a turn, both ways round are equally long, and the noise of the measured
+    yaw would otherwise choose one anew in every period.
     """
 
     def __init__(self) -> None:
@@ -145,25 +153,23 @@ class ReferenceTurns:
 
     def reset(self) -> None:
         """Restart: the next reference is a flight's first."""
-        self._first = math.nan
+        self._last_start = math.nan  # the first yaw of the reference a period ago; NaN before a flight
 
     def follow(self, reference: Array, yaw: float) -> Array:
-        """Return a period's reference (N, 4) on the turn of the vehicle's yaw [rad]; itself where it is already.
+        """Return a period's reference (N, 4) on the turn of the vehicle's yaw [rad]; the same array if it is already.
 
-        Call it once per period, one period apart.
+        Call it once per control period.
         """
         yaws = reference[:, 3]
-        first = yaws.item(0)
-        known = not math.isnan(self._first)
-        if known:
-            start = nearest_turn(first, self._first)
-        else:
-            start = first
+        start = yaws.item(0)
+        is_first = math.isnan(self._last_start)
+        if not is_first:
+            start = nearest_turn(start, self._last_start)
         if not math.isfinite(start + yaw):
             return reference
-        if not known or abs(yaw - start) > KEPT:
+        if is_first or abs(yaw - start) > KEPT:
             start += TURN * whole_turns(yaw - start)
-        self._first = start
+        self._last_start = start
         followed = unwrapped(yaws, start)
         if followed is yaws:
             return reference
@@ -180,19 +186,22 @@ def follow_turns(references: Array, yaws: Array, firsts: Array) -> Array:
         yaws: of the vehicles [rad].
         firsts: (M,) each flight's first row's yaw in the period before [rad], NaN before the first; updated in place.
     """
-    first = references[:, 0, 3]
-    near = np.abs(references[:, :, 3] - yaws[:, None]) < 0.2 * TURN  # so near that no two differ by half a turn
+    headings = references[:, :, 3]
+    first = headings[:, 0]
+    # Headings so near the vehicle differ by less than half a turn among themselves.
+    near = np.abs(headings - yaws[:, None]) < 0.2 * TURN
     if near.all() and (np.abs(first - firsts) < 0.4 * TURN).all():
         firsts[:] = first
         return references
     known = ~np.isnan(firsts)
-    start = first - TURN * np.where(known, whole_turns(first - np.where(known, firsts, first)), 0.0)
-    anew = ~known | (np.abs(yaws - start) > KEPT)
-    start = start + TURN * np.where(anew, whole_turns(yaws - start), 0.0)
+    last_start = np.where(known, firsts, first)
+    start = first - TURN * np.where(known, whole_turns(first - last_start), 0.0)
+    restarts = ~known | (np.abs(yaws - start) > KEPT)
+    start = start + TURN * np.where(restarts, whole_turns(yaws - start), 0.0)
     finite = np.isfinite(start + yaws)
     start = np.where(finite, start, first)
     firsts[finite] = start[finite]
-    steps = np.diff(references[:, :, 3], axis=1, prepend=start[:, None])
+    steps = np.diff(headings, axis=1, prepend=start[:, None])
     turns = whole_turns(steps)
     turns[~finite] = 0.0
     if not turns.any():
@@ -205,12 +214,13 @@ def follow_turns(references: Array, yaws: Array, firsts: Array) -> Array:
 class YawUnwrapper:
     """Counts a yaw's whole turns, sample by sample.
 
-    Past the vertical, Euler's yaw turns by 180 deg either way: upside down it is unwrapped to the last one, and upright
-    again to the last upright one, so a loop leaves the yaw unchanged.
+    Where the nose passes the vertical, the yaw of Euler angles jumps by 180 deg, one way or the other.  An upside-down
+    vehicle's yaw is unwrapped to the last yaw, an upright one's to the last upright yaw: a loop leaves it unchanged.
     """
 
     def __init__(self, yaw: float) -> None:
-        self._last = self._upright = yaw
+        self._last = yaw
+        self._last_upright = yaw
 
     def unwrapped(self, euler: Array) -> float:
         """Return the unwrapped yaw [rad] of roll, pitch, yaw (3,); a yaw that is not finite is returned unchanged."""
@@ -218,8 +228,8 @@ class YawUnwrapper:
         if math.isfinite(roll + pitch + yaw):
             upright = math.cos(roll) * math.cos(pitch) >= 0.0
             if upright:
-                yaw = nearest_turn(yaw, self._upright)
-                self._upright = yaw
+                yaw = nearest_turn(yaw, self._last_upright)
+                self._last_upright = yaw
             else:
                 yaw = nearest_turn(yaw, self._last)
             self._last = yaw
@@ -231,7 +241,7 @@ def make_state(
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),
     euler: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Array:
-    """A state at rest at `position` [m, world] with attitude roll, pitch, yaw `euler` [rad]."""
+    """Return the state (12,) at rest at a position [m, world], with roll, pitch, yaw `euler` [rad]."""
     state = np.zeros(N_STATES)
     state[list(POSITION)] = position
     state[list(EULER)] = euler
@@ -239,10 +249,12 @@ def make_state(
 
 
 def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
-    """Return (12,) one value each for positions, velocities, Euler angles and their rates."""
+    """Return (12,) with one value each for positions, velocities, Euler angles and their rates."""
     channels = np.empty(N_STATES)
-    for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
-        channels[list(group)] = value
+    channels[POSITIONS] = position
+    channels[VELOCITIES] = velocity
+    channels[ANGLES] = angle
+    channels[ANGLE_RATES] = rate
     return read_only(channels)
 
 

@@ -13,7 +13,7 @@ import os
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -42,6 +42,8 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
 from quadsim.state import Array
 
+_ROUNDING: Final = 1e-6  # [periods] by which a quotient of times may miss a whole number
+
 
 def closed_loop(
     assembly: Assembly,
@@ -52,7 +54,10 @@ def closed_loop(
     navigation: Navigation | None,
     recorded: bool = True,
 ) -> ClosedLoop:
-    """Return the loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `Assembly.followed`)."""
+    """Return the loop of a scenario, at t = 0.
+
+    The reference is (K + N, 4) x, y, z [m], yaw [rad], or an object that gives its rows (see `Assembly.followed`).
+    """
     scenario = assembly.scenario
     return ClosedLoop(
         plant,
@@ -73,7 +78,7 @@ def closed_loop(
 
 
 def needs_quaternions(scenario: Scenario) -> bool:
-    """Return whether one of its controllers flies at any attitude."""
+    """Return whether one of a scenario's controllers flies at any attitude, where Euler angles may be singular."""
     changed = [spec for _, spec in scenario.controller_changes]
     return any(spec.any_attitude for spec in (scenario.controller, *changed))
 
@@ -97,10 +102,10 @@ def _checked_controller(assembly: Assembly, user_controller: Controller | None) 
 
 
 def _check_parts(assembly: Assembly, controller: Controller) -> None:
-    """Refuse an autopilot that its controller does not command, and changes to controllers that cannot be built.
+    """Refuse an autopilot without a controller that commands it, and events with a controller that cannot be built.
 
     Raises:
-        InputError: naming the part.
+        InputError: it names the part.
     """
     if assembly.user_autopilot is not None and not takes_targets(controller):
         rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
@@ -110,14 +115,18 @@ def _check_parts(assembly: Assembly, controller: Controller) -> None:
 
 
 @contextlib.contextmanager
-def _staying() -> Iterator[None]:
-    """Restore the working directory, even if it has been removed."""
-    here = os.open(os.curdir, getattr(os, "O_PATH", os.O_RDONLY))
+def _restoring_working_directory() -> Iterator[None]:
+    """Return to the working directory at the end, even if it has been removed in between.
+
+    User code may change it.  The folder is kept open, because a path does not lead back to one that has been removed.
+    """
+    flags = getattr(os, "O_PATH", os.O_RDONLY)  # O_PATH, where it exists, needs no permission to read the folder
+    directory = os.open(os.curdir, flags)
     try:
         yield
     finally:
-        os.fchdir(here)
-        os.close(here)
+        os.fchdir(directory)
+        os.close(directory)
 
 
 class Rollout:
@@ -148,7 +157,7 @@ class Rollout:
         True
     """
 
-    @_staying()
+    @_restoring_working_directory()
     def __init__(
         self,
         scenario: Scenario | Assembly,
@@ -170,31 +179,31 @@ class Rollout:
         Raises:
             InputError: something cannot be built.
         """
+        threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
         if isinstance(scenario, Assembly):
             assembly = scenario
         else:
             assembly = Assembly(scenario)
         if live:
-            assembly = assembly.of(prepared(assembly))
-        threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
+            assembly = assembly.of(prepared(assembly))  # so that `apply` takes every kind of event
         controller = _checked_controller(assembly, user_controller)
         assembly = assembly.with_user_bounds(controller)
-        self._started = assembly.scenario
         _check_parts(assembly, controller)
         self.vehicle = assembly.vehicle
         self.actual = assembly.actual
         self.limits = assembly.limits
-        self._law_name = controller.name
+        self._controller_name = controller.name
         self._solver_name = controller.solver
-        self._own_code = user_controller is not None or forces is not None or assembly.user_autopilot is not None
+        self._longest_horizon = controller.horizon
+        self._has_user_code = user_controller is not None or forces is not None or assembly.user_autopilot is not None
         self._plant = assembly.plant(forces)
         self._navigation = assembly.navigation()
-        started = clock.perf_counter()
+        began = clock.perf_counter()
         self._reference = assembly.followed()
         self.loop = closed_loop(
             assembly, self._plant, controller, self._reference, navigation=self._navigation, recorded=recorded
         )
-        self._simulate_s = clock.perf_counter() - started
+        self._simulate_s = clock.perf_counter() - began
         build = None
         if user_controller is None:
             build = assembly.controller
@@ -206,11 +215,10 @@ class Rollout:
             loop=self.loop,
             build=build,
         )
-        self._longest_horizon = controller.horizon
 
     def __repr__(self) -> str:
         scenario = self.scenario
-        flown = f"{self.k * scenario.control_period:.2f} of {scenario.duration:g} s flown by {self._law_name}"
+        flown = f"{self.k * scenario.control_period:.2f} of {scenario.duration:g} s flown by {self._controller_name}"
         if self.loop.reason is not None:
             flown += f", {self.loop.reason}"
         return f"<Rollout {scenario.name}: {flown}>"
@@ -238,12 +246,12 @@ class Rollout:
 
     @property
     def done(self) -> bool:
-        """Whether it has reached its scenario's end, or ended early; without an early end it may continue."""
+        """Whether the flight has reached its scenario's end, where it may still be continued, or has ended early."""
         return self.loop.reason is not None or self.k >= self.scenario.periods
 
     @property
     def observation(self) -> Observation:
-        """The data at the start of this period; events applied from now on act in the next one.
+        """The data at the start of this period, measured once; events applied after that act from the next period on.
 
         Raises:
             FlightError: the vehicle is lost; the flight has ended.
@@ -256,35 +264,45 @@ class Rollout:
         """Fly one control period.
 
         Args:
-            command: replaces the controller's answer: a command, or (4,) rotor speeds [rad/s]. The scenario does not
-                record it, and flies without it.
+            command: replaces the controller's answer: a command, or (4,) rotor speeds [rad/s].  The scenario does not
+                record it: flying `scenario` again is a flight without it.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
-            InputError: it had ended before, is closed, or is as long as any may be.
+            InputError: it had ended before, is closed, or has the largest number of periods.
         """
         if self.loop.before is None:
             raise InputError("the flight is closed")
-        period = self._started.control_period
         self._longest_horizon = max(self._longest_horizon, self.loop.controller.horizon)
-        most_by_steps = MOST_STEPS // max(self._started.steps_per_period, self._longest_horizon)
-        most_by_time = math.floor(LONGEST_FLIGHT / period + 1e-6)
-        if self.k >= min(most_by_steps, most_by_time):
-            raise InputError(f"a flight has at most {self.k} control periods of {period} s")
+        if self.k >= self._most_periods:
+            raise InputError(f"a flight has at most {self.k} control periods of {self.scenario.control_period} s")
         if isinstance(command, Command):
             command = replace(command, speeds=np.array(command.speeds), plan=np.array(command.plan))
         elif command is not None:
             speeds = numbers_of(command)
             command = Command(speeds=speeds, plan=np.tile(speeds, (self.loop.controller.horizon, 1)))
-        started = clock.perf_counter()
+        began = clock.perf_counter()
         try:
             return self.loop.step(command)
         finally:
-            self._simulate_s += clock.perf_counter() - started
+            self._simulate_s += clock.perf_counter() - began
 
-    @_staying()
+    @property
+    def _most_periods(self) -> int:
+        """The largest number of control periods: within a day, and within the rows that the tables of a log may have.
+
+        The physics steps of a period take a row each, and so do the predicted samples of a period.
+        """
+        scenario = self.scenario
+        most_by_rows = MOST_STEPS // max(scenario.steps_per_period, self._longest_horizon)
+        most_by_time = math.floor(LONGEST_FLIGHT / scenario.control_period + _ROUNDING)
+        return min(most_by_rows, most_by_time)
+
+    @_restoring_working_directory()
     def fly(self, progress: Progress = silent, *, until: float = math.inf) -> Flight:
-        """Fly to the scenario's end, audit the flight and close; a flight error or Ctrl-C ends it early, in order.
+        """Fly to the scenario's end, audit the flight and close.
+
+        A flight error or Ctrl-C ends the flight early; the periods before are audited and returned all the same.
 
         A change of the working directory by a controller lasts only for the flight.
 
@@ -293,33 +311,41 @@ class Rollout:
             until: [s] ends it earlier, rounded up to whole control periods.
         """
         with self:
-            started = clock.perf_counter()
-            periods_until = math.ceil(min(until, LONGEST_FLIGHT) / self.scenario.control_period - 1e-6)
+            began = clock.perf_counter()
+            periods_until = math.ceil(min(until, LONGEST_FLIGHT) / self.scenario.control_period - _ROUNDING)
             periods = min(self.scenario.periods, periods_until)
             progress("flight", self.k, periods)
             complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
-            self._simulate_s += clock.perf_counter() - started
+            self._simulate_s += clock.perf_counter() - began
             return self.flight()
 
     @property
     def core_law(self) -> CoreController | None:
-        """The controller in the core, where a flight of this scenario needs nothing else; see `fly_in_core`."""
-        scenario = self._events.scenario
+        """The compiled controller that can fly this scenario in the core alone (`fly_in_core`).
+
+        None where the flight needs Python in between: for events of controller or set-point, for code of the user, for
+        computing time, ground or obstacles, or for a controller that the core does not have.
+        """
+        scenario = self.scenario
         controller = self.loop.controller
-        changing = any(isinstance(event, SetpointEvent | ControllerEvent) for event in scenario.events)
-        if changing or scenario.forces or self._own_code or self.loop.attends or needs_quaternions(scenario):
+        if self._has_user_code or scenario.forces or self.loop.beyond_core or needs_quaternions(scenario):
+            return None
+        if any(isinstance(event, SetpointEvent | ControllerEvent) for event in scenario.events):
             return None
         if not isinstance(controller, Pilot):
             return None
         return controller.in_core()
 
     def fly_in_core(self, law: CoreController) -> Flight | None:
-        """Fly a flight that has not begun by its `core_law`, audit it and close; None where the loop has to fly it.
+        """Fly all periods in the core by `core_law`, audit the flight and close; call it before any other period.
 
         The flight lacks predictions and KKT residuals; all other numbers are those of `fly`.
+
+        Returns:
+            the flight; None where a period needs more than the core has, so that only `fly` of a new rollout gives it.
         """
         scenario = self.scenario
-        started = clock.perf_counter()
+        began = clock.perf_counter()
         with self:
             log = fly_in_core(
                 law,
@@ -331,17 +357,18 @@ class Rollout:
                 navigation=self._navigation,
                 loss=scenario.lost.limits,
             )
-            self._simulate_s += clock.perf_counter() - started
+            self._simulate_s += clock.perf_counter() - began
             if log is None:
                 return None
             return self._flight_of(log, scenario)
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
-        """Apply an event from the next period on that is not yet observed, like an event of the file.
+        """Apply an event, like one of the file, from the first period on that is not yet observed.
 
         Args:
             event: an entry of `events`; `at` is set here.
-            successor: for an event `controller`, the result of `successor` for its fields; built here by default.
+            successor: for an event `controller`, what `successor` returned for its fields; by default it is built
+                here, which takes time.
 
         Returns:
             The event with its time, as the scenario now has it.
@@ -363,14 +390,15 @@ class Rollout:
         return self._events.successor(fields)
 
     def leave_course(self) -> None:
-        """End the constraints on the tracking error: from now on somebody steers, and no course is flown."""
+        """End the constraints on the tracking error: from now on a person steers, and no course is followed."""
         self._events.leave_course()
         self.limits = self._events.assembly.limits
 
     def margins(self, sample: Period | None = None) -> dict[str, float]:
         """Return the smallest signed margin of each constraint within one period; negative = beyond the bound.
 
-        At the physics rate, both ends included, in the constraint's unit; NaN outside its time window.
+        A margin is in the constraint's unit, over the states before and after each physics step.  Outside the
+        constraint's time window it is NaN.
 
         Args:
             sample: the period; by default the last one.
@@ -384,7 +412,7 @@ class Rollout:
     def violations(self, sample: Period | None = None) -> dict[str, float]:
         """Return how far each constraint is exceeded beyond its tolerance within one period: g <= 0 if it holds.
 
-        In its unit, at its worst; minus infinity outside its time window.
+        The largest g of the period counts, in the constraint's unit; outside its time window, g is minus infinity.
 
         Args:
             sample: the period; by default the last one.
@@ -405,7 +433,7 @@ class Rollout:
         return self._flight_of(self.loop.log(), scenario)
 
     def _flight_of(self, log: FlightLog, scenario: Scenario) -> Flight:
-        """Return a log as a flight of a scenario, audited."""
+        """Audit a log, and return it as a flight of a scenario."""
         assembly = self._events.assembly.of(scenario)
         tallies: Mapping[SensorName, Tally] = {}
         if self._navigation is not None:
@@ -415,19 +443,19 @@ class Rollout:
             assembly=assembly,
             log=log,
             findings=audit(log, self.limits),
-            controller=self._law_name,
+            controller=self._controller_name,
             solver=self._solver_name,
             simulate_s=self._simulate_s,
             tallies=tallies,
             infeasible_period=self._events.first_infeasible_period(),
-            own_code=self._own_code,
+            own_code=self._has_user_code,
             try_remedies=_try_remedies,
         )
 
 
 def _try_remedies(explanation: Mapping[str, Any], flight: Flight) -> dict[str, Any]:
-    """See `quadsim.rollout.remedies.tried`."""
-    from quadsim.rollout import growth, remedies  # late: few flights need them
+    """Fly the changes that a flight's diagnosis suggests; see `quadsim.rollout.remedies.tried`."""
+    from quadsim.rollout import growth, remedies  # imported here because few flights need them
 
     def fly(assembly: Assembly, until: float) -> Flight:
         return Rollout(assembly).fly(until=until)
@@ -439,7 +467,7 @@ def _try_remedies(explanation: Mapping[str, Any], flight: Flight) -> dict[str, A
 
 
 def fly_for_table(scenario: Scenario) -> Flight:
-    """Fly a scenario for its verdict, margins and metrics: in the core where nothing else is needed.
+    """Fly a scenario for its verdict, margins and metrics; in the core, which is faster, wherever it can.
 
     The flight may lack predictions and KKT residuals (`Rollout.fly_in_core`); all other numbers are those of
     `Rollout.fly`.
@@ -453,7 +481,7 @@ def fly_for_table(scenario: Scenario) -> Flight:
         return rollout.fly()
     flight = rollout.fly_in_core(law)
     if flight is None:
-        return Rollout(scenario).fly()
+        return Rollout(scenario).fly()  # from the start again: the core left it in the middle
     return flight
 
 

@@ -53,11 +53,15 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("quadsim")
 _HEIGHT: Final = REFERENCE_NAMES.index("z")
 TAKEOFF_LEAD: Final = "takeoff_lead"
-"""What is logged of `quadsim.flight.phase.TakeoffLead` in the periods that have one [m]."""
+"""Name of the logged signal: by how much `quadsim.flight.phase.TakeoffLead` raises the reference in a period [m]."""
 
 
-Hold = tuple[InnerLoop | None, Array, int]
-"""A command (4,) or (8,) in force for a number of physics steps, and the inner loop that flies it."""
+class Hold(NamedTuple):
+    """A command that is in force for a number of physics steps."""
+
+    inner: InnerLoop | None  # the inner loop that flies the command; None: the command is rotor speeds
+    command: Array  # (4,) or (8,)
+    steps: int
 
 
 class Reference(Protocol):
@@ -97,9 +101,10 @@ class ClosedLoop:
         k: control periods flown so far.
         period: length of one [s].
         controller: the controller in command; see `switch`.
-        course: the reference that is followed; observations have its yaw on the turn of the measured one.
+        course: the reference that is followed.  Observations have it with its yaw changed by whole turns to be near the
+            measured yaw.
         answered: latest time at which a command has arrived so far [s].
-        before: called with k at the start of a period, before any measurement; its changes act in that period.
+        before: called with k at the start of a period, before any measurement.  What it changes acts in that period.
         last: the last period; None before the first.
         reason: why the flight ended early; None while it has not.
     """
@@ -135,72 +140,66 @@ class ClosedLoop:
             navigation: measured or estimated state for the controller; the true state where absent.
             computation: how long commands take, in simulated time; none where absent.
             rng: what `computation` draws from.
-            ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
+            ground: finds the phase of the flight from contact with ground and obstacles; absent: always flying.
             loss: limits by the names of `quadsim.flight.phase.CRITERIA`, checked once per control period until it has
                 crashed; none where absent.
-            motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
+            motion: the reference with its derivatives from t_0 on, for controllers that use them; absent where only
+                positions and yaw are known.
             quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
             recorded: whether all periods are stored, for `log`: some 10 kB each.
         """
+        self._yaw = float(initial_state[INDEX["yaw"]])
         plant.reset(initial_state, initial_speeds)
         controller.reset(initial_speeds)
-        _tell_attitude(controller, plant)
-        self.k = 0
-        self.period = steps_per_period * plant.timestep
-        self.controller = controller
-        self.computation = computation
-        self.motion = motion
-        self.answered = 0.0
-        self.before: Callable[[int], None] | None = None
-        self.reason: str | None = None
-        self._criterion: str | None = None
-        self._interrupted = False
-        self._traceback: tuple[str, ...] = ()
-        self._yaw = float(initial_state[INDEX["yaw"]])
+        _tell_body_rates(controller, plant)
         if navigation is not None:
             navigation.reset(plant.physics, initial_speeds, yaw=self._yaw)
         if ground is not None:
             ground.reset()
+
+        if isinstance(reference, np.ndarray):
+            reference = KnownReference(values=reference)
+        if rng is None:
+            rng = np.random.default_rng(0)
+
+        self.k = 0
+        self.period = steps_per_period * plant.timestep
+        self.controller = controller
+        self.course: Reference = reference
+        self.computation = computation
+        self.motion = motion
+        self.quaternions = quaternions
+        self.answered = 0.0
+        self.before: Callable[[int], None] | None = None
+        self.last: Period | None = None
+        self.reason: str | None = None
+        self._loss_criterion: str | None = None
+        self._interrupted = False
+        self._traceback: tuple[str, ...] = ()
+
         self._plant = plant
         self._navigation = navigation
         self._ground = ground
         self._turns = ReferenceTurns()
-        if isinstance(reference, np.ndarray):
-            reference = KnownReference(values=reference)
-        self.course: Reference = reference
-        self._steps = steps_per_period
-        self._loss = loss
-        self.quaternions = quaternions
-        if rng is None:
-            rng = np.random.default_rng(0)
-        self._draws = rng
+        self._steps_per_period = steps_per_period
+        self._loss_limits = loss
+        self._rng = rng
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
-        self._lowest = float(initial_state[INDEX["z"]])
-        self._acting = self._initial_speeds  # the command sent last: rotor speeds, or the target of an autopilot
-        self._inner: InnerLoop | None = None  # flies it
-        # What acts in the coming periods: those that commands spend under way, and the one in which the next arrives.
-        self._under_way = 0
-        if computation is not None:
-            self._under_way = computation.whole_periods(steps_per_period, plant.timestep)
-        held: list[Hold] = [(self._inner, self._acting, steps_per_period)]
-        self._schedule: deque[list[Hold]] = deque([held] * self._under_way)
-        self._speeds = self._initial_speeds  # the rotor speeds commanded last
-        self._flying: _Flying | None = None  # the inner loop called last
-        # the last plan that came in time, and how many periods ago
-        self._plan = self._acting[None]
-        self._age = 0
+        self._last_speeds = self._initial_speeds  # the rotor speeds commanded last
+        self._lowest_reference = float(initial_state[INDEX["z"]])  # [m]
+        self._commands = _CommandsUnderWay(self._initial_speeds, computation, steps_per_period, plant.timestep)
+        self._active_inner: _ActiveInnerLoop | None = None  # the inner loop called last
         self._observed: Observation | None = None
         self._samples: list[Period] | None = None
         if recorded:
             self._samples = []
-        self.last: Period | None = None
-        self._predicted: list[_Prediction] = []  # of the controllers before this one, and how many periods they flew
-        self._switched = 0
+        self._earlier_predictions: list[_Prediction] = []  # of the controllers before this one
+        self._switched_at = 0  # the first period of this controller
 
     @property
-    def attends(self) -> bool:
-        """Whether its periods depend on computing time, on the ground or on obstacles."""
+    def beyond_core(self) -> bool:
+        """Whether periods depend on computing time, on the ground or on obstacles, which `core_loop` leaves out."""
         return self.computation is not None or self._ground is not None
 
     @property
@@ -216,24 +215,24 @@ class ClosedLoop:
     def switch(self, controller: Controller) -> None:
         """Let another controller fly from the period that starts now on.
 
-        It is reset, and then given the one before it where it is `Adopting`: an observer, a plan and the state of a
-        fallback go on by it.
+        It is reset.  If it is `Adopting`, it then takes over what the controller before it has learned: its observer,
+        its plan and the state of its fallback.
 
         Raises:
-            InputError: the period that starts now is observed already, by the preview of the one before.
+            InputError: the period that starts now is already observed, with the preview of the controller before.
             RaisedError: its `reset` or `adopt` raised.
         """
         if self._observed is not None:
             raise InputError("a controller takes over before a period is observed, not after")
         with _ending_flight(self.time):
-            controller.reset(self._speeds.copy())
-            _tell_attitude(controller, self._plant)
+            controller.reset(self._last_speeds.copy())
+            _tell_body_rates(controller, self._plant)
             if isinstance(controller, Adopting):
                 controller.adopt(self.controller)
-        if self.k > self._switched:
-            self._predicted.append(self._predict())
+        if self.k > self._switched_at:
+            self._earlier_predictions.append(self._predict())
         self.controller = controller
-        self._switched = self.k
+        self._switched_at = self.k
 
     @property
     def truth(self) -> Array:
@@ -251,19 +250,20 @@ class ClosedLoop:
         return self._plant.speeds
 
     def followed(self, yaw: float) -> Array:
-        """Return the reference now and as far ahead as the controller looks (1 + N, 4), on the turn of a yaw [rad]."""
-        ahead = [self.course.row(self.k)[None], self.course.preview(self.k, self.controller.horizon)]
-        return self._turns.follow(np.concatenate(ahead), yaw)
+        """Return the reference now and over the controller's preview (1 + N, 4), on the turn of a yaw [rad]."""
+        now = self.course.row(self.k)
+        preview = self.course.preview(self.k, self.controller.horizon)
+        return self._turns.follow(np.concatenate([now[None], preview]), yaw)
 
     @property
     def observation(self) -> Observation:
-        """What the period that starts now begins with, made once.
+        """The data at the start of the period that starts now; measured at the first call, then kept.
 
         Raises:
             FlightError: the vehicle is lost; the flight has ended.
         """
         if self._observed is None:
-            self._require_going_on()
+            self._require_not_ended()
             try:
                 self._observed = self._observe()
             except FlightError as error:
@@ -272,20 +272,20 @@ class ClosedLoop:
         return self._observed
 
     def step(self, command: Command | None = None) -> Period:
-        """Fly one control period, with a command that is held instead of asking the controller, where one is given.
+        """Fly one control period; a command that is given here replaces the controller's answer.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before.
         """
-        self._require_going_on()
+        self._require_not_ended()
         observation = self.observation
         try:
             sample = self._fly(observation, command)
         except FlightError as error:
             self._end(error)
             raise
-        self.k = self.k + 1
+        self.k += 1
         self._observed = None
         self.last = sample
         if self._samples is not None:
@@ -314,8 +314,8 @@ class ClosedLoop:
             self._plant.timestep,
             quaternions=self.quaternions,
         )
-        predictions = list(self._predicted)
-        if self.k > self._switched:
+        predictions = list(self._earlier_predictions)
+        if self.k > self._switched_at:
             predictions.append(self._predict())
         return replace(
             log,
@@ -324,100 +324,116 @@ class ClosedLoop:
             reason=self.reason,
             interrupted=self._interrupted,
             traceback=self._traceback,
-            lost=self._criterion,
+            lost=self._loss_criterion,
         )
 
-    def _require_going_on(self) -> None:
+    def _require_not_ended(self) -> None:
         if self.reason is not None:
             raise InputError(f"the flight has ended {self.reason}")
 
     def _end(self, error: FlightError) -> None:
-        """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
+        """Note why the flight ended.
+
+        The error itself is not kept: its traceback refers to this loop, and this cycle would keep all of it in memory.
+        """
         self.reason = str(error)
-        self._criterion = None
+        self._loss_criterion = None
         self._traceback = ()
         if isinstance(error, LostError):
-            self._criterion = error.criterion
+            self._loss_criterion = error.criterion
         if isinstance(error, RaisedError):
             self._traceback = error.traceback
 
     def _observe(self) -> Observation:
+        """Measure at t_k, and check that the vehicle is not lost.
+
+        Raises:
+            LostError: it is.
+        """
         k = self.k
-        plant = self._plant
-        navigation = self._navigation
         if self.before is not None:
             self.before(k)
-        truth = plant.state()
-        if navigation is None:
+        truth = self._plant.state()
+        if self._navigation is None:
             state = truth.copy()
-            attitude, body_rates = plant.attitude
+            attitude, body_rates = self._plant.attitude
         else:
-            state = navigation.state()
-            attitude, body_rates = navigation.attitude
-        rows = self.followed(float(state[INDEX["yaw"]]))
-        row = rows[0]
-        preview = rows[1:]
-        phase = Phase.FLYING
-        if self._ground is not None:
-            if self.last is None:
-                since = self._start[None]
-            else:
-                since = self.last.steps["physics"]
-            phase = self._ground.advance(since[:, 0], physics_to_state(since), preview)
-        self._lowest = min(self._lowest, float(row[_HEIGHT]))
-        if self._loss is not None and phase is not Phase.CRASHED:
-            check_loss(self._loss, self.time, truth, row, self._lowest)
+            state = self._navigation.state()
+            attitude, body_rates = self._navigation.attitude
+        reference_rows = self.followed(float(state[INDEX["yaw"]]))
+        reference = reference_rows[0]
+        preview = reference_rows[1:]
+        phase = self._current_phase(preview)
+        self._lowest_reference = min(self._lowest_reference, float(reference[_HEIGHT]))
+        if self._loss_limits is not None and phase is not Phase.CRASHED:
+            check_loss(self._loss_limits, self.time, truth, reference, self._lowest_reference)
         motion = None
         if self.motion is not None:
             motion = self.motion.after(k)
         now = StepInputs(
             time=self.time,
             phase=phase,
-            acting=self._speeds,
+            acting=self._last_speeds,
             attitude=attitude,
             body_rates=body_rates,
             motion=motion,
             signals=LoggedSignals(),
         )
-        return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
+        return Observation(k=k, state=state, truth=truth, reference=reference, preview=preview, moment=now)
+
+    def _current_phase(self, preview: Array) -> Phase:
+        """Return the phase of the flight after the physics steps since the last period began."""
+        if self._ground is None:
+            return Phase.FLYING
+        if self.last is None:
+            physics = self._start[None]
+        else:
+            physics = self.last.steps["physics"]
+        times = physics[:, 0]
+        return self._ground.advance(times, physics_to_state(physics), preview)
 
     def _predict(self) -> _Prediction:
-        """Predict the controller's periods; nothing where it has no model, or raised."""
+        """Return what the controller predicts for the periods that it flew; nothing if it has no model, or raised."""
         controller = self.controller
-        samples = (self._samples or [])[self._switched :]
+        samples: list[Period] = []
+        if self._samples is not None:
+            samples = self._samples[self._switched_at :]
         nothing = _Prediction(len(samples), None, None)
         if not samples or not isinstance(controller, Predicting | Foreseeing):
             return nothing
         measured = [sample.observation.state for sample in samples]
         planned = [sample.command.plan for sample in samples]
         states = np.stack(measured)
-        foreseen = None
+        next_states = None
         predicted = None
         try:
             with user_code(lambda error: InputError(described(error))):
                 plans = np.stack(planned)
                 if isinstance(controller, Foreseeing):
-                    foreseen = controller.foresee(states, plans[:, 0])
+                    next_states = controller.foresee(states, plans[:, 0])
                 if isinstance(controller, Predicting):
                     predicted = controller.predict(states, plans)
                 if predicted is None:
-                    return _Prediction(len(samples), None, foreseen)
-                if foreseen is None:
-                    foreseen = predicted[:, 0].copy()
-                return _Prediction(len(samples), predicted[:, :, list(POSITION)], foreseen)
-        except InputError as error:  # after the flight, which is not to be lost by it
+                    return _Prediction(len(samples), None, next_states)
+                if next_states is None:
+                    next_states = predicted[:, 0].copy()
+                return _Prediction(len(samples), predicted[:, :, list(POSITION)], next_states)
+        except InputError as error:  # the flight itself is over, and is kept
             _log.warning("no predictions are kept: predict raised %s", error)
             return nothing
 
-    def _asked(self, observed: Observation) -> tuple[StepInputs, Array, Array]:
-        """Return a controller's inputs; the reference is raised where it has to be for the vehicle to take off."""
+    def _controller_inputs(self, observed: Observation) -> tuple[StepInputs, Array, Array]:
+        """Return the arguments of the controller's `step`: its inputs, the measured state and the reference ahead.
+
+        For a take-off, the reference is raised by the height that the vehicle needs to leave the ground.
+        """
         now = observed.moment
         state = observed.state
         preview = observed.preview
         if self._ground is None or now.phase in GROUNDED:
             return now, state, preview
-        thrust = float(np.sum(np.square(self._plant.speeds)))
-        lead = self._ground.lead(observed.truth, float(observed.reference[_HEIGHT]), thrust)
+        squared_speeds = float(np.sum(np.square(self._plant.speeds)))  # proportional to the thrust
+        lead = self._ground.lead(observed.truth, float(observed.reference[_HEIGHT]), squared_speeds)
         if lead == 0.0:
             return now, state, preview
         now.log(TAKEOFF_LEAD, lead, "m")
@@ -428,65 +444,31 @@ class ClosedLoop:
         return now, state, raised
 
     def _fly(self, observed: Observation, command: Command | None) -> Period:
+        """Fly the period that starts now: ask for its command, send it, and take the physics steps."""
         plant = self._plant
-        computation = self.computation
-        steps = self._steps
         now = observed.moment
         step_s = 0.0
         if command is None:
             started = clock.perf_counter()
             with _ending_flight(now.time):
-                command = self.controller.step(*self._asked(observed))
+                command = self.controller.step(*self._controller_inputs(observed))
             step_s = clock.perf_counter() - started
-        if computation is None:
-            delay = 0.0
-        else:
-            delay = computation.taken(now.time, command, self._draws)
+        delay = 0.0
+        if self.computation is not None:
+            delay = self.computation.taken(now.time, command, self._rng)
         self.answered = max(self.answered, now.time + delay)
-        # From the start of the period in which it arrives, this one where none spends a whole period under way.
-        wait = physics_steps(delay, plant.timestep) - self._under_way * steps
-        missed = wait > steps  # one that comes just in time acts from the next period on
-        due = min(wait, steps)
-        if computation is not None and computation.plan:
-            due = min(due, physics_steps(computation.delay, plant.timestep) - self._under_way * steps)
-        planned = self._plan[min(self._age + 1, len(self._plan) - 1)]  # its last row beyond its end
-        inner = self._inner
-        continued = min(wait, steps) - due  # physics steps under the last plan's next row
-        holds: list[Hold] = [(inner, self._acting, due), (inner, planned, continued)]
-        if missed:
-            self._age += 1
-            acting = self._acting
-            if continued:
-                acting = planned
-        else:
-            acting = command.speeds
-            self._plan = command.plan
-            self._age = 0
-            self._inner = command.inner
-            holds.append((self._inner, acting, steps - wait))
-        self._schedule.append(holds)
+        missed = self._commands.send(command, delay, self.computation)
         before = plant.physics
-        on_ground = now.phase in (Phase.LANDED, Phase.ARMED)
-        plant.begin(steps)
-        if self._navigation is None:
-            sensing = None
-        else:
-            sensing = self._navigation.begin(steps)
-        for loop, row, count in self._schedule.popleft():
-            if count > 0:
-                self._hold(loop, row, count, sensing)
-        if self._navigation is not None:
-            self._navigation.record(plant.flown, on_ground=on_ground)
-        self._acting = acting
+        self._take_physics_steps(self._commands.next_period(), now.phase)
         target = None
-        self._speeds = acting
-        if takes_targets(self._inner):
-            target = acting
-            self._speeds = plant.flown["commands"][-1].copy()
+        self._last_speeds = self._commands.last
+        if takes_targets(self._commands.inner):
+            target = self._commands.last
+            self._last_speeds = plant.flown["commands"][-1].copy()
         return Period(
             observation=observed,
             command=command,
-            speeds=self._speeds,
+            speeds=self._last_speeds,
             target=target,
             delay=delay,
             missed=missed,
@@ -496,55 +478,152 @@ class ClosedLoop:
             rotors=plant.speeds,
         )
 
-    def _hold(self, inner: InnerLoop | None, row: Array, steps: int, sensing: Struct | None) -> None:
+    def _take_physics_steps(self, holds: Sequence[Hold], phase: Phase) -> None:
+        """Fly the physics steps of a period under the commands in force, and record the sensors' samples."""
+        plant = self._plant
+        navigation = self._navigation
+        plant.begin(self._steps_per_period)
+        sensing = None
+        if navigation is not None:
+            sensing = navigation.begin(self._steps_per_period)
+        for hold in holds:
+            if hold.steps > 0:
+                self._hold(hold, sensing)
+        if navigation is not None:
+            navigation.record(plant.flown, on_ground=phase in (Phase.LANDED, Phase.ARMED))
+
+    def _hold(self, hold: Hold, sensing: Struct | None) -> None:
         """Fly physics steps under a command, by an inner loop if there is one.
 
         Raises:
             RaisedError: the inner loop raised, or its period is not a whole number of physics steps.
         """
         plant = self._plant
+        inner = hold.inner
         if inner is None:
-            plant.hold(row, steps, sensing=sensing)
+            plant.hold(hold.command, hold.steps, sensing=sensing)
             return
         with _ending_flight(plant.time):
-            flying = self._flying
-            fresh = self._flying is None or self._flying.inner is not inner
-            if fresh:
-                self._flying = flying = _Flying(inner, inner_steps(inner.rate, plant.timestep))
-            assert flying is not None
-            if flying.engage is None:
-                struct = flying.struct
-            else:
-                struct = flying.engage(row, plant.speeds) or flying.struct
+            active = self._active_inner
+            if active is None or active.inner is not inner:
+                active = _ActiveInnerLoop(inner, inner_steps(inner.rate, plant.timestep))
+                self._active_inner = active
+            struct = active.engage(hold.command, plant.speeds)
         measured = None
-        if flying.measures:
+        if active.measures:
             measured = self._navigation
 
         def ask() -> Array:
+            """Return the answer of an inner loop that is not in the core."""
             if measured is None:
                 attitude, rates = plant.attitude
             else:
                 attitude, rates = measured.sensed(plant.physics)
             with _ending_flight(plant.time):
-                return np.array(inner.speeds(plant.time, row.copy(), rates, plant.speeds, attitude))
+                return np.array(inner.speeds(plant.time, hold.command.copy(), rates, plant.speeds, attitude))
 
-        struct.stride = flying.stride
-        if fresh:
-            struct.until = 0
-        plant.hold(row, steps, loop=struct, sensing=sensing, ask=ask)
+        plant.hold(hold.command, hold.steps, loop=struct, sensing=sensing, ask=ask)
 
 
-class _Flying:
-    """An inner loop in force: its stride, whether it measures, and its place in the core where that does not answer."""
+class _CommandsUnderWay:
+    """The commands between the controller and the plant: what is in force in this period and in those to come.
+
+    Without computing time, a command is in force for the period that it was computed in.  A `Computation` lets it
+    arrive later: after whole periods, and then some physics steps into a period.
+
+    Attributes:
+        last: (4,) or (8,) the command that is in force at the end of the period sent last.
+        inner: the inner loop that flies it.
+    """
+
+    def __init__(
+        self, initial_speeds: Array, computation: Computation | None, steps_per_period: int, timestep: float
+    ) -> None:
+        self.last = initial_speeds
+        self.inner: InnerLoop | None = None
+        self._steps_per_period = steps_per_period
+        self._timestep = timestep
+        self._plan = initial_speeds[None]  # the last plan that arrived in time,
+        self._plan_age = 0  # and how many periods ago
+        self._whole_periods = 0  # that each command spends under way before the period in which it arrives
+        if computation is not None:
+            self._whole_periods = computation.whole_periods(steps_per_period, timestep)
+        initial = [Hold(None, initial_speeds, steps_per_period)]
+        self._periods: deque[list[Hold]] = deque([initial] * self._whole_periods)
+
+    def next_period(self) -> list[Hold]:
+        """Return the holds of the next period, each once."""
+        return self._periods.popleft()
+
+    def send(self, command: Command, delay: float, computation: Computation | None) -> bool:
+        """Send a command that arrives after a delay [s]; return whether it missed its deadline and is dropped.
+
+        In the period of its arrival, the command before stays in force at first.  The last plan's next row follows it
+        from the time at which the command was due, if plans continue.  From its arrival on, the command is in force.
+
+        Args:
+            command: the command.
+            delay: simulated time from the measurement to its arrival [s].
+            computation: says when a command is due, and whether plans continue; None: no computing time.
+        """
+        steps = self._steps_per_period
+        arrival = self._steps_into_period(delay)
+        missed = arrival > steps  # one that comes just in time is in force from the next period on
+        end = min(arrival, steps)  # where what is in force before it ends
+        plan_start = end
+        if computation is not None and computation.plan:
+            plan_start = min(end, self._steps_into_period(computation.delay))
+        plan_row = min(self._plan_age + 1, len(self._plan) - 1)  # beyond the plan's end, its last row
+        continued = Hold(self.inner, self._plan[plan_row], end - plan_start)
+        holds = [Hold(self.inner, self.last, plan_start), continued]
+        if missed:
+            self._plan_age += 1
+            if continued.steps:
+                self.last = continued.command
+        else:
+            self._plan = command.plan
+            self._plan_age = 0
+            self.inner = command.inner
+            self.last = command.speeds
+            holds.append(Hold(self.inner, self.last, steps - arrival))
+        self._periods.append(holds)
+        return missed
+
+    def _steps_into_period(self, delay: float) -> int:
+        """Return the physics steps from the start of the period of arrival until a delay [s] has passed."""
+        return physics_steps(delay, self._timestep) - self._whole_periods * self._steps_per_period
+
+
+class _ActiveInnerLoop:
+    """An inner loop that is in force.
+
+    Attributes:
+        inner: the inner loop.
+        measures: whether it receives sensors' samples, as an autopilot does; else the true attitude and rates.
+    """
 
     def __init__(self, inner: InnerLoop, stride: int) -> None:
         self.inner = inner
-        self.stride = stride
-        self.struct = InnerStruct()
         self.measures = takes_targets(inner)
-        self.engage: Callable[[Array, Array], Struct | None] | None = None
+        self._stride = stride  # physics steps between answers
+        self._has_answered = False
+        self._outside = InnerStruct()  # for the core where `inner` answers in Python
+        self._engage: Callable[[Array, Array], Struct | None] | None = None
         if isinstance(inner, Engaging):
-            self.engage = inner.engage
+            self._engage = inner.engage
+
+    def engage(self, command: Array, rotors: Array) -> Struct:
+        """Put a command in force at rotor speeds (4,) [rad/s]; return the struct by which the core flies it."""
+        struct = None
+        if self._engage is not None:
+            struct = self._engage(command, rotors)
+        if struct is None:
+            struct = self._outside
+        struct.stride = self._stride
+        if not self._has_answered:
+            struct.until = 0  # the first answer is due at once
+            self._has_answered = True
+        return struct
 
 
 def fly(
@@ -565,8 +644,8 @@ def fly(
 def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] | None = None) -> None:
     """Fly on until a number of control periods have been flown in all.
 
-    Whatever happens in flight ends up in its log: a typed flight error or Ctrl-C ends it early, with its reason and
-    everything up to it.  `progress` is called with the number of periods flown, after each.
+    A flight error or Ctrl-C ends the flight early; its log then has the reason, and all periods before.  `progress` is
+    called after each period with the number of periods flown.
     """
     hold = current_hold()
     with uncollected():
@@ -578,7 +657,7 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
         except FlightError:
             pass  # the loop has noted it
         except KeyboardInterrupt:
-            hold.flown = True  # before any call, in which the next signal would come
+            hold.flown = True  # before the call below: the next signal could come within it
             loop.interrupt()
         finally:
             hold.flown = True
@@ -586,11 +665,11 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
-    """Keep the garbage collector from all that is there already.
+    """Exempt the objects that exist now from garbage collection within a block.
 
-    A pass over all imported modules takes up to 30 ms, as long as a control period.
+    A collection that visits all imported modules takes up to 30 ms, as long as a control period.
     """
-    if gc.get_freeze_count():
+    if gc.get_freeze_count():  # an outer block has exempted them
         yield
         return
     gc.freeze()
@@ -600,14 +679,15 @@ def uncollected() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _tell_attitude(controller: Controller, plant: Plant) -> None:
-    """Tell a controller that wants to know how the vehicle turns now."""
+def _tell_body_rates(controller: Controller, plant: Plant) -> None:
+    """Tell a controller that is `Beginning` the body rates now."""
     if isinstance(controller, Beginning):
-        controller.begin(plant.attitude[1])
+        _, body_rates = plant.attitude
+        controller.begin(body_rates)
 
 
 def _ending_flight(time: float) -> AbstractContextManager[None]:
-    """Make whatever a controller's code raises the flight's end, not its loss."""
+    """Turn whatever a controller's code raises into a flight error, so that the flight ends and is kept."""
     return user_code(lambda error: RaisedError("the controller", error, time=time), passing=(FlightError,))
 
 
@@ -616,11 +696,11 @@ class _Prediction(NamedTuple):
 
     periods: int
     positions: Array | None  # (K, N, 3) [m]
-    next_states: Array | None  # (K, 12) for the period after each
+    next_states: Array | None  # (K, 12) at the start of the period after each
 
 
 def _joined_next_states(predictions: Sequence[_Prediction]) -> Array | None:
-    """The states (K, 12) that each controller predicted for the next period, NaN of those that did not."""
+    """Return the predicted states (K, 12) of the next periods: NaN for controllers without a model, None for all."""
     if all(prediction.next_states is None for prediction in predictions):
         return None
     parts = []
@@ -633,7 +713,7 @@ def _joined_next_states(predictions: Sequence[_Prediction]) -> Array | None:
 
 
 def _joined_positions(predictions: Sequence[_Prediction]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
-    """The positions that each controller predicted, as far ahead as all of them did; None where one did not."""
+    """Return the predicted positions, cut to the shortest of the horizons; None if a controller predicted none."""
     parts = []
     for prediction in predictions:
         if prediction.positions is None:

@@ -1,8 +1,8 @@
 """The simulator's state over physics steps, its conversion to the paper's state, and flown periods as a log.
 
-A physics step is time, position, quaternion, velocity and body rates, as MuJoCo has them; a state of the paper is
-x, vx, ..., yaw, yaw_rate (`quadsim.state`).  `Period` has what one control period recorded; `flight_log` stacks the
-periods into the `quadsim.flight.log.FlightLog` that the audit reads.
+MuJoCo's state (14,) is time, position, quaternion, velocity and body rates; a state of the paper (12,) is x, vx, ...,
+yaw, yaw_rate (`quadsim.state`).  `Period` has what one control period recorded; `flight_log` stacks the periods into
+the `quadsim.flight.log.FlightLog` that the audit reads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from quadsim.controller import FALLBACK, MISSED, Command, Phase, Statistics, StepInputs
+from quadsim.controller import ATTITUDE, FALLBACK, MISSED, TARGET_SIZES, Command, Phase, Statistics, StepInputs
 from quadsim.core.mirror import core_library
 from quadsim.errors import ParameterError
 from quadsim.flight.log import (
@@ -40,14 +40,23 @@ PHYSICS: Final = {
 """Columns of MuJoCo's state (14,), whose first is the time [s]."""
 PhysicsSteps = NDArray[np.void]
 """Physics steps, a row each, with the fields of `steps_type`."""
-Integrator = Literal["mujoco", "rk4"]  # integrator of the physics steps: MuJoCo, or the core's own method
+Integrator = Literal["mujoco", "rk4"]
+"""The integrator of the physics steps: MuJoCo, or the core's own Runge-Kutta method for a free rigid body."""
 
 
 def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
-    """Convert a count of physics steps, derived from a parameter, to a whole number.
+    """Round a count of steps that follows from a parameter, and that is whole up to rounding.
+
+    Args:
+        owner: what has the parameter, for the error.
+        name: the parameter's name, for the error.
+        value: the parameter's value, for the error.
+        count: the number of steps that follows from it.
+        rule: what the parameter must be, for the error.
+        smallest: the smallest count allowed.
 
     Raises:
-        ParameterError: it is not whole, or too small.
+        ParameterError: the count is not whole, or too small.
     """
     steps = round(count)
     if steps < smallest or not math.isclose(steps, count, rel_tol=1e-9, abs_tol=1e-9):
@@ -76,13 +85,17 @@ def inner_steps(rate: float, timestep: float, owner: str = "controller.inner") -
 
 
 def steps_type(*, wrench: bool = False, wind: bool = False, battery: bool = False) -> np.dtype[np.void]:
-    """Return the type of a row of `PhysicsSteps`; fields that nothing causes are absent.
+    """Return the type of a row of `PhysicsSteps`, one physics step.
 
-    `physics` (14,) is MuJoCo's state after the step; `speeds` (4,) are the rotor speeds at its start, `commands` (4,)
-    those commanded during it, saturated [rad/s]; `thrust` is the collective thrust in its middle [N]; `wrench` (6,) is
-    the force, world [N], and torque, body frame about its origin [N m], of all effects but contact over the step;
-    `wind` (3,) is the velocity of the air in its middle, world [m/s]; `battery` (2,) is the voltage over the step [V]
-    and the charge at its start [-].
+    - `physics` (14,): MuJoCo's state after the step.
+    - `speeds` (4,): rotor speeds at its start [rad/s].
+    - `commands` (4,): rotor speeds commanded during it, saturated [rad/s].
+    - `thrust`: collective thrust in its middle [N].
+    - `wrench` (6,): force, world [N], and torque, body frame about its origin [N m], of all effects but contact.
+    - `wind` (3,): velocity of the air in its middle, world [m/s].
+    - `battery` (2,): voltage over the step [V], and charge at its start [-].
+
+    In a plant without such forces, wind or a battery, the last three are absent.
     """
     fields: list[tuple[str, type[float], int | tuple[()]]] = [
         ("physics", float, 14),
@@ -102,16 +115,18 @@ def steps_type(*, wrench: bool = False, wind: bool = False, battery: bool = Fals
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """Convert MuJoCo's states to the paper's states (M, 12).
 
-    They have Euler-angle rates (Sec.  2.2 uses body rates), and a yaw unwrapped along the rows as by `YawUnwrapper`.
+    The rates are those of the Euler angles (Sec. 2.2 of the paper uses body rates).  The yaw is unwrapped along the
+    rows as by `YawUnwrapper`.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
         yaw: the first row's yaw is unwrapped to the turn nearest to it [rad].
     """
-    if physics.strides[1:] != (8,):
+    number = np.dtype(np.float64).itemsize
+    if physics.strides[1:] != (number,):  # the core steps from row to row, but takes the numbers of a row as adjacent
         physics = np.ascontiguousarray(physics, np.float64)
     states = np.empty((len(physics), N_STATES))
-    width = physics.strides[0] // 8
+    width = physics.strides[0] // number
     core_library().quadsim_states(physics.ctypes.data, len(physics), width, yaw, states.ctypes.data)
     return states
 
@@ -135,13 +150,13 @@ class Period:
     observation: Observation  # the data at its start
     command: Command  # the controller's answer, or the command passed to `step`
     speeds: Array
-    """(4,) u(k), the rotor speeds of `command`, of an earlier one if it was missed, or of an autopilot at its end
-    [rad/s]."""
-    target: Array | None  # (4,) or (8,) the same as a target of an autopilot; None without one
+    """(4,) u(k) [rad/s], the commanded rotor speeds in force at the end of the period: of `command`, of an earlier one
+    if `command` was missed, or the autopilot's last answer."""
+    target: Array | None  # (4,) or (8,) the autopilot's target in force at the end of the period; None without one
     delay: float  # simulated time from the measurement to the command [s]
     missed: bool  # whether the command came too late
     step_s: float  # wall time of the controller's step [s]; 0 if the command was passed in
-    before: Array  # (14,) MuJoCo's state at its start; see `quadsim.sim.physics.physics_to_state`
+    before: Array  # (14,) MuJoCo's state at its start; see `physics_to_state`
     steps: PhysicsSteps  # (M,) its physics steps
     rotors: Array  # (4,) rotor speeds at its end [rad/s]
 
@@ -176,50 +191,56 @@ class Period:
 
 
 def flight_log(
-    samples: Sequence[Period], start: Array, speeds: Array, yaw: float, period: float, timestep: float,
-    *, quaternions: bool = False,
-) -> FlightLog:  # fmt: skip
-    """Convert control periods of a length [s] to a log with plant rows at the physics rate.
+    samples: Sequence[Period],
+    start: Array,
+    speeds: Array,
+    yaw: float,
+    period: float,
+    timestep: float,
+    *,
+    quaternions: bool = False,
+) -> FlightLog:
+    """Convert control periods to a log with plant rows at the physics rate.
 
-    The start is given by MuJoCo's state (14,), rotor speeds (4,) [rad/s] and a yaw [rad], for its turns.
+    Args:
+        samples: the control periods.
+        start: (14,) MuJoCo's state at the start of the first.
+        speeds: (4,) rotor speeds there, and u(-1) [rad/s].
+        yaw: the yaw of `start` is on the turn nearest to it [rad].
+        period: length of a control period [s].
+        timestep: length of a physics step [s].
+        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
     """
     control = _control_log(samples, speeds, period)
     plant = _plant_log(samples, start, speeds, yaw, timestep)
     if quaternions:
-        attitudes = []
-        rates = []
-        parts = [start[None]]
-        for sample in samples:
-            attitudes.append(sample.observation.moment.attitude)
-            rates.append(sample.observation.moment.body_rates)
-            parts.append(sample.steps["physics"])
+        attitudes = [sample.observation.moment.attitude for sample in samples]
+        rates = [sample.observation.moment.body_rates for sample in samples]
         control = replace(
             control,
             attitude=np.array(attitudes, float).reshape(-1, 4),
             body_rates=np.array(rates, float).reshape(-1, 3),
         )
-        physics = np.concatenate(parts)
-        attitude = physics[:, PHYSICS["attitude"]]
-        body_rates = physics[:, PHYSICS["body_rates"]]
-        plant = replace(plant, attitude=attitude, body_rates=body_rates)
+        steps = [sample.steps["physics"] for sample in samples]
+        physics = np.concatenate([start[None], *steps])
+        plant = replace(plant, attitude=physics[:, PHYSICS["attitude"]], body_rates=physics[:, PHYSICS["body_rates"]])
     if control.target is not None:
         thrusts = [_thrusts(sample) for sample in samples]
-        thrust = np.concatenate(thrusts)
-        plant = replace(plant, thrust=np.append(thrust, thrust[-1]))
+        plant = replace(plant, thrust=_at_instants(np.concatenate(thrusts)))
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
 
 def one_period(sample: Period, timestep: float) -> PeriodLog:
-    """Return what the margins of a control period take."""
+    """Return the log of one control period from which its margins are computed."""
     observed = sample.observation
-    moment = sample.observation.moment
+    moment = observed.moment
     steps = sample.steps
     assert moment.acting is not None
     target = None
     thrust = None
     if sample.target is not None:
         target = sample.target[None, :4]
-        thrust = np.append(steps["thrust"], steps["thrust"][-1:])
+        thrust = _at_instants(steps["thrust"])
     t = moment.time + timestep * np.arange(len(steps) + 1)
     physics = np.concatenate([sample.before[None], steps["physics"]])
     return PeriodLog(
@@ -247,7 +268,6 @@ def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float
     truth = np.empty((count, N_STATES))
     reference = np.empty((count, 4))
     speeds = np.empty((count, N_ROTORS))
-    rows = np.empty((count, len(Statistics._fields)))
     fallback = np.empty(count, np.int64)
     delay = np.empty(count)
     status = []
@@ -256,39 +276,19 @@ def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float
     signals = []
     for k, sample in enumerate(samples):
         observed = sample.observation
-        command = sample.command
         state[k] = observed.state
         truth[k] = observed.truth
         reference[k] = observed.reference
         speeds[k] = sample.speeds
-        rows[k] = command.stats
+        fallback[k] = _fallback(sample)
         delay[k] = sample.delay
+        status.append(_status(sample))
+        answered_by.append(_answered_by(sample))
         phase.append(str(sample.phase))
-        fallback[k] = command.fallback
-        if sample.missed:
-            fallback[k] = max(command.fallback, 1)
-            status.append(MISSED)
-        else:
-            status.append(command.status)
-        if fallback[k]:
-            answered_by.append(FALLBACK)
-        else:
-            answered_by.append(command.answered_by)
         if isinstance(observed.moment.signals, LoggedSignals):
             signals.append(observed.moment.signals)
-    stats = dict(zip(Statistics._fields, rows.T.copy(), strict=True))
-    del stats["solve_s"]  # a clock time
-    progress = np.column_stack([stats.pop("sqp_defect"), stats.pop("sqp_step")])
-    sqp = None
-    if not np.isnan(progress).all():
-        sqp = progress
-    targets = _targets(samples)
-    target = None
-    target_attitude = None
-    if targets is not None:
-        target = targets[:, :4]
-        if not np.isnan(targets[:, 4:]).all():
-            target_attitude = targets[:, 4:]
+    statistics = _statistics(samples)
+    target, target_attitude = _targets(samples)
     return ControlLog(
         t=instants(count, period),
         state=state,
@@ -299,35 +299,79 @@ def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float
         status=tuple(status),
         answered_by=tuple(answered_by),
         phase=tuple(phase),
-        iterations=stats.pop("iterations").astype(np.int64),
-        active=stats.pop("active").astype(np.int64),
+        iterations=statistics.pop("iterations").astype(np.int64),
+        active=statistics.pop("active").astype(np.int64),
         fallback=fallback,
-        **stats,
         delay=delay,
-        sqp=sqp,
+        sqp=_sqp_progress(statistics.pop("sqp_defect"), statistics.pop("sqp_step")),
         target=target,
         target_attitude=target_attitude,
         logged=stacked(signals),
+        **statistics,
     )
 
 
+def _fallback(sample: Period) -> int:
+    """Return the level of fallback of a period; a command that was missed is at least the first."""
+    if sample.missed:
+        return max(sample.command.fallback, 1)
+    return sample.command.fallback
+
+
+def _status(sample: Period) -> str:
+    if sample.missed:
+        return MISSED
+    return sample.command.status
+
+
+def _answered_by(sample: Period) -> str:
+    """Return the source of the command in force."""
+    if _fallback(sample) > 0:
+        return FALLBACK
+    return sample.command.answered_by
+
+
+def _statistics(samples: Sequence[Period]) -> dict[str, Array]:
+    """Return columns (K,) by the names of `Statistics`, without the time that a clock measured."""
+    rows = np.empty((len(samples), len(Statistics._fields)))
+    for k, sample in enumerate(samples):
+        rows[k] = sample.command.stats
+    columns = dict(zip(Statistics._fields, rows.T.copy(), strict=True))
+    del columns["solve_s"]
+    return columns
+
+
+def _sqp_progress(defect: Array, step: Array) -> Array | None:
+    """Return both as columns (K, 2); None if no period has a number."""
+    progress = np.column_stack([defect, step])
+    if np.isnan(progress).all():
+        return None
+    return progress
+
+
 def _thrusts(sample: Period) -> Array:
-    """(M,) collective thrust over the steps of a period [N]; NaN where no autopilot has a target."""
+    """Return the collective thrust (M,) in the steps of a period [N]; NaN where no autopilot has a target."""
     thrust: Array = sample.steps["thrust"]
     if sample.target is None:
         return np.full(len(thrust), math.nan)
     return thrust
 
 
-def _targets(samples: Sequence[Period]) -> Array | None:
-    """(K, 8) targets in force, four numbers and an attitude, NaN where there is none; None without an autopilot."""
+def _targets(samples: Sequence[Period]) -> tuple[Array | None, Array | None]:
+    """Return the autopilot's targets in force: thrust and body rates (K, 4), and attitudes (K, 4).
+
+    They are NaN in periods without; None where no period has any.
+    """
     if all(sample.target is None for sample in samples):
-        return None
-    rows = np.full((len(samples), 8), math.nan)
+        return None, None
+    rows = np.full((len(samples), TARGET_SIZES[ATTITUDE]), math.nan)
     for row, sample in zip(rows, samples, strict=True):
         if sample.target is not None:
             row[: sample.target.size] = sample.target
-    return rows
+    attitude = rows[:, 4:]
+    if np.isnan(attitude).all():
+        return rows[:, :4], None
+    return rows[:, :4], attitude
 
 
 def _timing_log(samples: Sequence[Period], t: Array) -> TimingLog:
@@ -350,15 +394,14 @@ def plant_log(steps: PhysicsSteps, rotors: Array, start: Array, yaw: float, time
         steps: the steps.
         rotors: (4,) rotor speeds at the end [rad/s].
         start: (14,) MuJoCo's state before the first.
-        yaw: the first row's is on the turn nearest to it [rad].
-        timestep: [s].
+        yaw: the yaw of `start` is on the turn nearest to it [rad].
+        timestep: length of a step [s].
     """
     physics = np.concatenate([start[None], steps["physics"]])
-    # What acts during a step is shown from its start on, so the last row repeats that of the last step.
     acting = {}
     for name in ("wrench", "wind", "battery"):
         if name in (steps.dtype.names or ()):
-            acting[name] = np.append(steps[name], steps[name][-1:], axis=0)
+            acting[name] = _at_instants(steps[name])
     return PlantLog(
         t=instants(len(physics), timestep),
         state=physics_to_state(physics, yaw),
@@ -367,6 +410,11 @@ def plant_log(steps: PhysicsSteps, rotors: Array, start: Array, yaw: float, time
     )
 
 
+def _at_instants(values: Array) -> Array:
+    """Return what acts during M steps as M + 1 rows: one at each step's start, and the last one again at the end."""
+    return np.append(values, values[-1:], axis=0)
+
+
 def instants(count: int, spacing: float) -> Array:
-    """Return instants k * spacing, without the rounding of accumulation or binary fractions."""
+    """Return the instants k * spacing [s], rounded to the nanosecond so that 3 * 0.1 is 0.3."""
     return np.round(np.arange(count) * spacing, 9)

@@ -32,6 +32,7 @@ from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterE
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, munk_moment, obstacle_body, outline
 from quadsim.sim.effects import LOADING, Change, Effects, Force, PushChange
+from quadsim.sim.effects.battery import Battery
 from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, apply_mass, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
@@ -41,10 +42,11 @@ from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOC
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
-_POSITION: Final = 3  # numbers of a position
-_POSE: Final = 7  # and of a pose, with its quaternion
-_MOTION: Final = 13  # and of a motion, with velocity and body rates
-_PHYSICS: Final = 14  # and of MuJoCo's state, with the time
+_POSE: Final = 7  # numbers of a pose: position and quaternion
+_MOTION: Final = 13  # numbers of a motion: pose, velocity and body rates
+_PHYSICS: Final = 14  # numbers of MuJoCo's state: time and motion
+_QUATERNION: Final = slice(3, 7)  # of a pose
+_BODY_RATES: Final = slice(3, 6)  # of a velocity (6,)
 _PLAUSIBLE: Final = 1e6
 """Largest magnitude of time [s], position [m], speed [m/s] or rate [rad/s] that is not divergence."""
 _NUMERICAL_WARNINGS: Final = (
@@ -54,20 +56,20 @@ _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADCTRL,
 )
 _BLOCK: Final = 2048  # normal numbers that are drawn at a time
-_CALM: Final = Effects()
-_AS_IN_THE_FILE: Final = Load()
+_NO_EFFECTS: Final = Effects()
+_NO_LOAD: Final = Load()
 _CARRYING: Final = (Payload, PayloadDrop)
 """Changes that move the centre of mass."""
 
 
 def _has_callbacks() -> bool:
-    """Return whether MuJoCo has callbacks."""
+    """Return whether somebody has set a callback of MuJoCo, such as one for the control."""
     getters = [name for name in dir(mujoco) if name.startswith("get_mjcb_")]
     return any(getattr(mujoco, name)() is not None for name in getters)
 
 
 if not _has_callbacks():
-    # Its Python bindings time each part of each step, which takes two fifths of a step's time.
+    # MuJoCo's Python bindings set a timer callback, which takes two fifths of a step's time; this removes it.
     mujoco.mj_resetCallbacks()
 
 
@@ -102,7 +104,7 @@ class Plant:
         *,
         timestep: float = 1e-3,
         limit_speeds: bool = False,
-        effects: Effects = _CALM,
+        effects: Effects = _NO_EFFECTS,
         changes: Sequence[Change] = (),
         wind: WindField | None = None,
         forces: Sequence[Force] = (),
@@ -113,59 +115,72 @@ class Plant:
         self.vehicle = vehicle
         self.timestep = timestep
         self.effects = effects
-        self._load = effects.load or _AS_IN_THE_FILE
-        air = effects.air or Air()
-        loading = any(isinstance(change, LOADING) for change in changes)
-        self._reweighed = self._load != _AS_IN_THE_FILE or loading
+        self._integrator = integrator
+        self._wind = wind
+        self._user_forces = tuple(forces)
         self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
+        self._load = effects.load or _NO_LOAD
+        loading = any(isinstance(change, LOADING) for change in changes)
+        self._sets_mass = self._load != _NO_LOAD or loading  # mass properties are not always those of the file
         if limit_speeds:
             self._speed_range = (vehicle.speed_min, vehicle.speed_max)
         else:
             self._speed_range = (0.0, math.inf)
         self._yaw = YawUnwrapper(0.0)
-        self._wind = wind
-        self._own = tuple(forces)
-        self._integrator = integrator
-        self._motion: Array = np.zeros(_MOTION)
-        self._velocity = self._motion[_POSE:]
         self.model: Any = None
         self._data: Any = None
         if integrator == "rk4":
             check_free(effects, changes, obstacles)
+            self._motion: Array = np.zeros(_MOTION)
+            self._velocity = self._motion[_POSE:]
         else:
-            self.model = compile_model(
-                vehicle,
-                timestep=timestep,
-                limit_speeds=limit_speeds,
-                contact=effects.ground is not None and effects.ground.contact,
-                reweighed=self._reweighed,
-                body_drag=air.body_drag,
-                air_density=air.density,
-                obstacles=obstacles,
-            )
-            self._data = mujoco.MjData(self.model)
-            self._motion = self._data.qpos
-            self._velocity = self._data.qvel
-            mujoco.set_mju_user_warning(_discard)
-        pushed = any(isinstance(change, PushChange) for change in changes)
-        self._follows_motion = effects.follows_state or wind is not None or bool(self._own) or pushed
-        self._follows_motion = self._follows_motion or bool(self._moving) or integrator == "rk4"
-        self._forced = self._follows_motion
-        if integrator == "rk4":  # which adds disturbances and forces of the user to those that follow from the motion
-            self._forced = replace(effects, disturbance=None).follows_state
+            self._compile(obstacles, limit_speeds=limit_speeds)
+        self._has_forces = self._can_have_forces(changes)
+        self._computes_forces = self._has_forces  # in the core, in every step; a push needs them while it acts
+        if integrator == "rk4":  # it adds disturbances and the user's forces without computing others
+            self._computes_forces = replace(effects, disturbance=None).follows_state
         self._steps_type = steps_type(
-            wrench=self._follows_motion, wind=wind is not None, battery=effects.battery is not None
+            wrench=self._has_forces, wind=wind is not None, battery=effects.battery is not None
         )
-        if self._moving:
-            bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
-            assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
         self._changes = self._scheduled(changes)
         if rng is None:
             rng = np.random.default_rng(0)
-        self._reset_to: tuple[bytes, Array] = b"", np.zeros(_MOTION)
+        self._last_reset = b""  # the bytes of the state (12,) of the last reset, and the same as a motion (13,)
+        self._last_motion = np.zeros(_MOTION)
         self._seed(rng)
         self._struct = self._make_struct()
         self.reset(np.zeros(N_STATES))
+
+    def _compile(self, obstacles: Sequence[Obstacle], *, limit_speeds: bool) -> None:
+        """Compile MuJoCo's model of the vehicle and its surroundings."""
+        effects = self.effects
+        air = effects.air or Air()
+        self.model = compile_model(
+            self.vehicle,
+            timestep=self.timestep,
+            limit_speeds=limit_speeds,
+            contact=effects.ground is not None and effects.ground.contact,
+            reweighed=self._sets_mass,
+            body_drag=air.body_drag,
+            air_density=air.density,
+            obstacles=obstacles,
+        )
+        if self._moving:
+            bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
+            in_order = list(range(len(bodies)))
+            assert self.model.body_mocapid[bodies].tolist() == in_order  # the core writes their positions in this order
+        self._data = mujoco.MjData(self.model)
+        self._motion = self._data.qpos
+        self._velocity = self._data.qvel
+        mujoco.set_mju_user_warning(_discard)
+
+    def _can_have_forces(self, changes: Sequence[Change]) -> bool:
+        """Return whether forces other than the rotors' thrust may act, so that physics steps have a wrench."""
+        if self._integrator == "rk4" or self._wind is not None or self._user_forces or self._moving:
+            return True
+        if any(isinstance(change, PushChange) for change in changes):
+            return True
+        return self.effects.follows_state
 
     def __enter__(self) -> Plant:
         return self
@@ -174,7 +189,7 @@ class Plant:
         self.close()
 
     def close(self) -> None:
-        """Free native memory; the plant cannot fly on."""
+        """Free native memory, with all arrays that refer to it; the plant cannot fly on."""
         for name in ("_struct", "_data", "model", "_motion", "_velocity"):
             self.__dict__.pop(name, None)
 
@@ -208,15 +223,22 @@ class Plant:
         return int(self._struct.now)
 
     def _seed(self, rng: np.random.Generator) -> None:
-        # A generator each, so that neither draw changes the other's, however time is cut.
-        self._generators = rng, rng.spawn(1)[0]
+        """Draw from a generator from now on."""
+        # Noise and disturbances have a generator each: neither draw changes the other's, however time is cut.
+        self._generators = (rng, rng.spawn(1)[0])
         disturbance = self.effects.disturbance
         if disturbance is None:
-            self._lasting = None
+            self._coloured_noise = None
         else:
-            self._lasting = disturbance.lasting(self.timestep, rng)
-        self._starts = [generator.bit_generator.state for generator in self._generators]
-        self._ahead = [NormalsAhead(generator) for generator in self._generators]
+            self._coloured_noise = disturbance.lasting(self.timestep, rng)
+        self._initial_states = [generator.bit_generator.state for generator in self._generators]
+        self._draw_anew()
+
+    def _draw_anew(self) -> None:
+        """Forget the numbers that are drawn ahead."""
+        for_noise, for_disturbance = self._generators
+        self._noise = NormalsAhead(for_noise)
+        self._disturbance = NormalsAhead(for_disturbance)
 
     def redraw(self, rng: np.random.Generator, wind: WindField | None) -> None:
         """Take other draws from the next reset on: of noise and disturbances, and of the wind if there is one."""
@@ -232,93 +254,75 @@ class Plant:
         state = np.asarray(state, float)
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
-        motion = self._motion_of(state)
+        self._reset_vehicle(state, speeds)
+        if self._sets_mass:
+            self._set_load(self._load.payloads, self._load.mass_factor)
+        for generator, initial in zip(self._generators, self._initial_states, strict=True):
+            generator.bit_generator.state = initial
+        self._draw_anew()
+        if self._wind is not None:
+            self._wind.reset()
+        if self._coloured_noise is not None:
+            self._coloured_noise.reset()
+        for force in self._user_forces:
+            if hasattr(force, "reset"):
+                force.reset()
+
+    def _reset_vehicle(self, state: Array, speeds: Array | None) -> None:
+        """Put the vehicle at a state (12,) at time zero, with the properties that it has before any change."""
         self._yaw = YawUnwrapper(float(state[EULER[2]]))
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
         self._efficiency = np.array(self._rotors.efficiency)
-        struct = self._struct
+        self._pushes: Array = np.empty((0, 6))
+        motion = self._motion_of(state)
         if self._integrator == "mujoco":
             mujoco.mj_resetData(self.model, self._data)
             mujoco.mj_setState(self.model, self._data, np.append(0.0, motion), _FULL)
         else:
             self._motion[:] = motion
+        struct = self._struct
         struct.now = 0
         struct.time = 0.0
-        if self.effects.battery is None:
-            struct.charge = 0.0
-        else:
-            struct.charge = self.effects.battery.charge
+        struct.before[:] = motion[_POSE:]
         if speeds is None:
             struct.speeds[:] = self.vehicle.hover_speeds
         else:
             struct.speeds[:] = np.array(speeds, float)
-        struct.before[:] = motion[_POSE:]
-        self._pushes: Array = np.empty((0, 6))
-        self._tell()
-        if self._reweighed:
-            self._carry(self._load.payloads, self._load.mass_factor)
-        for generator, start in zip(self._generators, self._starts, strict=True):
-            generator.bit_generator.state = start
-        self._ahead = [NormalsAhead(generator) for generator in self._generators]
-        if self._wind is not None:
-            self._wind.reset()
-        if self._lasting is not None:
-            self._lasting.reset()
-        for force in self._own:
-            getattr(force, "reset", lambda: None)()
+        struct.charge = 0.0
+        if self.effects.battery is not None:
+            struct.charge = self.effects.battery.charge
+        self._write_changes()
 
     def _motion_of(self, state: Array) -> Array:
         """Return the motion (13,) of a state, kept for the next reset to the same one."""
         text = state.tobytes()
-        if text != self._reset_to[0]:
+        if text != self._last_reset:
             euler = state[ANGLES]
             rates = euler_to_body_rates(euler, state[ANGLE_RATES])
             parts = [state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
-            self._reset_to = text, np.concatenate(parts)
-        return self._reset_to[1]
+            self._last_motion = np.concatenate(parts)
+            self._last_reset = text
+        return self._last_motion
 
     def _make_struct(self) -> Struct:
         """Return the core's vehicle, with all that does not change."""
-        v = VehicleStruct()
         vehicle = self.vehicle
         effects = self.effects
-        data = self._data
+        v = VehicleStruct()
         v.timestep = self.timestep
         v.plausible = _PLAUSIBLE
         v.fastest_valid = LARGEST_SPEED
         v.gravity = vehicle.gravity
-        _weigh(v, vehicle.mass, vehicle.inertia_matrix)
-        v.linear, quadratic = vehicle.thrust_law
-        v.coefficient[:] = quadratic
-        v.hover = vehicle.hover_speed
-        # Power is torque times speed, (a_1 w + a_2 w^2) w; of each rotor at hover speed, over the mean rotor's.
-        ratios = vehicle.hover_speeds / vehicle.hover_speed
-        mean = vehicle.mean_coefficient
-        power = quadratic / mean
-        linear_power = v.linear / (mean * vehicle.hover_speed)
-        total = float(power @ ratios**3) + linear_power * float((ratios**2).sum())
-        v.demand[:] = N_ROTORS * power / total
-        v.linear_demand = N_ROTORS * linear_power / total
         v.slowest, v.fastest = self._speed_range
-        v.spin[:] = np.array(vehicle.rotor_spins, float)
-        fill(v.place, vehicle.hubs)
-        fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
+        v.motion = self._motion.ctypes.data
+        v.velocity = self._velocity.ctypes.data
+        _set_mass(v, vehicle.mass, vehicle.inertia_matrix)
+        _set_rotors(v, vehicle)
         if effects.rotors is not None:
             v.rotor_inertia = effects.rotors.inertia or 0.0
-        air = effects.air
-        if air is not None:
-            v.rotor_drag = air.rotor_drag or 0.0
-            v.rotor_moment[:] = air.rotor_moment or (0.0, 0.0)
-            v.rate_damping[:] = air.rate_damping or (0.0, 0.0, 0.0)
-            if air.inflow_moment is not None:
-                by_body = (0.0, 0.0)
-                if air.body_drag is not None:  # MuJoCo's ellipsoid gives a part
-                    by_body = munk_moment(air.body_drag, air.density)
-                v.inflow_moment[:] = np.subtract(air.inflow_moment, by_body)
-            v.inflow = air.inflow or 0.0
-            v.linear_drag[:] = air.linear_drag
-            v.quadratic_drag[:] = air.quadratic_drag
+        if effects.air is not None:
+            _set_air(v, effects.air)
         ground = effects.ground
         if ground is not None and ground.effect:
             shape = outline(vehicle)
@@ -330,26 +334,21 @@ class Plant:
             v.loss = noise.loss
             v.deviation = noise.deviation
             v.largest[:] = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
-        battery = effects.battery
-        if battery is not None:
-            self._curve = np.array(battery.curve)
-            v.curve = self._curve.ctypes.data
-            v.points = len(self._curve)
-            v.cells = battery.cells
-            v.capacity = battery.capacity
-            v.resistance = battery.resistance
-            v.hover_current = battery.hover_current
-            v.idle_current = battery.idle_current
-            v.reference_voltage = battery.reference_voltage
-            v.exponent = battery.exponent
-        v.motion = self._motion.ctypes.data
-        v.velocity = self._velocity.ctypes.data
-        if self._integrator == "rk4":
-            return v
+        if effects.battery is not None:
+            self._curve = np.array(effects.battery.curve)  # kept, as the core reads it by its address
+            _set_battery(v, effects.battery, self._curve)
+        if self._integrator == "mujoco":
+            self._connect_mujoco(v)
+        return v
+
+    def _connect_mujoco(self, v: Struct) -> None:
+        """Give the core the addresses of MuJoCo's step, and of what it reads and writes there."""
+        data = self._data
         v.step = step_address()
         v.model, v.data = addresses(self.model, data)
         v.applied = data.qfrc_applied.ctypes.data
         v.control = data.ctrl.ctypes.data
+        air = self.effects.air
         if air is not None and air.body_drag is not None:
             v.fluid = data.qfrc_fluid.ctypes.data
             if self._wind is not None:
@@ -357,10 +356,9 @@ class Plant:
         if self._moving:
             v.obstacles = data.mocap_pos.ctypes.data
             v.mocaps = len(self._moving)
-        return v
 
-    def _tell(self) -> None:
-        """Tell the core what events change."""
+    def _write_changes(self) -> None:
+        """Write to the core's vehicle what changes in flight: rotors and pushes."""
         v = self._struct
         rotors = self._rotors
         v.rise = rotors.rise or 0.0
@@ -370,7 +368,7 @@ class Plant:
         v.efficiency[:] = self._efficiency
         v.pushes = self._pushes.ctypes.data
         v.pushing = len(self._pushes)
-        v.follows_motion = self._forced or len(self._pushes) > 0
+        v.follows_motion = self._computes_forces or len(self._pushes) > 0
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
@@ -381,7 +379,7 @@ class Plant:
     @property
     def attitude(self) -> tuple[Array, Array]:
         """The true attitude now (4,), wxyz, body to world, sign continuous, and the body rates (3,) [rad/s]."""
-        return self._motion[_POSITION:_POSE].copy(), self._velocity[_POSITION:].copy()
+        return self._motion[_QUATERNION].copy(), self._velocity[_BODY_RATES].copy()
 
     def advance(self, speeds: Array, steps: int) -> PhysicsSteps:
         """Hold commanded rotor speeds (4,) [rad/s] for M physics steps, at least 1; return these (M,).
@@ -395,18 +393,21 @@ class Plant:
         return self.flown
 
     def begin(self, steps: int) -> None:
-        """Begin a period of M physics steps: `hold` fills its rows."""
+        """Begin a period of M physics steps, whose rows `hold` fills.
+
+        The core receives the address of each column of the rows in their first row, and the width of a row.
+        """
         flown = np.empty(steps, self._steps_type)
         rows = StepsStruct()
+        start = flown.ctypes.data
         assert flown.dtype.fields is not None
-        at = flown.ctypes.data
         for name, (_, offset, *_) in flown.dtype.fields.items():
-            setattr(rows, name, at + offset)
-        rows.width = flown.itemsize // 8
+            setattr(rows, name, start + offset)
+        rows.width = flown.itemsize // np.dtype(np.float64).itemsize
         drawn: dict[str, Array] = {}
         if self.effects.thrust_noise is not None:
             drawn["noise"] = np.empty((steps, N_ROTORS))
-        if self.effects.disturbance is not None or self._own:
+        if self.effects.disturbance is not None or self._user_forces:
             drawn["disturbance"] = np.zeros((steps, 6))
         if self._moving:
             drawn["obstacles"] = np.empty((steps, 3 * len(self._moving)))
@@ -428,10 +429,10 @@ class Plant:
         """Fly some steps of the period that `begin` began.
 
         Args:
-            command: (4,) rotor speeds [rad/s], where there is no inner loop.
+            command: (4,) rotor speeds [rad/s]; not used if there is an inner loop.
             steps: their number.
             loop: the inner loop that flies a command.
-            sensing: what takes samples after each step.
+            sensing: the sensors that take samples after each step.
             ask: answers for an inner loop that is not in the core.
 
         Raises:
@@ -455,7 +456,7 @@ class Plant:
         sensing: Struct | None,
         ask: Answers | None,
     ) -> None:
-        """Let the core fly to a physics step while only vehicle and air change."""
+        """Fly to a physics step in the core, up to which nothing is left to apply or to draw."""
         v = self._struct
         rows = self._rows
         fly = core_library().quadsim_fly
@@ -484,7 +485,12 @@ class Plant:
             raise CommandError(problem, time=self.time)
 
     def check(self, why: int, loop: Struct | None, complaint: bytes) -> None:
-        """Raise what ended a flight by the core, for this reason; `complaint` is MuJoCo's.
+        """Raise the error for which the core stopped, if it is one.
+
+        Args:
+            why: what the core returned, one of `End`.
+            loop: the inner loop that flies, if there is one.
+            complaint: MuJoCo's message if it failed.
 
         Raises:
             CommandError: the inner loop's answer is not four finite numbers.
@@ -504,8 +510,10 @@ class Plant:
     @property
     def unattended(self) -> bool:
         """Whether the core can fly all periods to come by itself: nothing changes, and nothing is drawn."""
-        attended = self._pending or self._own or self._moving or self._wind is not None
-        return not (attended or self.effects.thrust_noise is not None or self.effects.disturbance is not None)
+        effects = self.effects
+        changing = bool(self._pending or self._user_forces or self._moving)
+        drawn = effects.thrust_noise is not None or effects.disturbance is not None or self._wind is not None
+        return not changing and not drawn
 
     def stage(self, steps: int) -> int:
         """Apply the changes that are due, and draw; return how many of the next physics steps may be flown at once.
@@ -513,14 +521,15 @@ class Plant:
         Raises:
             FlightError: a force of the user raised.
         """
-        self._change()
-        if self._own:
+        self._apply_due_changes()
+        if self._user_forces:
             steps = 1
         elif self._pending:
-            steps = min(steps, self._pending[0][0] - self._step)
+            next_change, _ = self._pending[0]
+            steps = min(steps, next_change - self._step)
         self._draw(steps)
-        if self._own:
-            self._drawn["disturbance"][self._rows.row] += self._own_wrench()
+        if self._user_forces:
+            self._drawn["disturbance"][self._rows.row] += self._user_wrench()
         return steps
 
     @property
@@ -537,17 +546,16 @@ class Plant:
         """Draw for the next steps of the period."""
         rows = slice(self._rows.row, self._rows.row + steps)
         drawn = self._drawn
-        of_noise, of_disturbance = self._ahead
         if self._wind is not None:
             self.flown["wind"][rows] = self._wind.advance(steps)
         if "noise" in drawn:
-            drawn["noise"][rows] = of_noise.standard_normal((steps, N_ROTORS))
+            drawn["noise"][rows] = self._noise.standard_normal((steps, N_ROTORS))
         if self.effects.disturbance is not None:
-            drawn["disturbance"][rows] = self.effects.disturbance.draw(steps, self.timestep, of_disturbance)
-        elif self._own:
+            drawn["disturbance"][rows] = self.effects.disturbance.draw(steps, self.timestep, self._disturbance)
+        elif self._user_forces:
             drawn["disturbance"][rows] = 0.0
-        if self._lasting is not None:
-            drawn["disturbance"][rows] += self._lasting.advance(steps)
+        if self._coloured_noise is not None:
+            drawn["disturbance"][rows] += self._coloured_noise.advance(steps)
         if self._moving:
             times = self.timestep * np.arange(self._step, self._step + steps, dtype=np.float64)
             positions = [obstacle.positions(times) for obstacle in self._moving]
@@ -556,11 +564,11 @@ class Plant:
     def allows(self, changes: Sequence[Change]) -> bool:
         """Return whether it was built for changes of these kinds."""
         for change in changes:
-            if isinstance(change, LOADING) and not self._reweighed:
+            if isinstance(change, LOADING) and not self._sets_mass:
                 return False
             if isinstance(change, _CARRYING) and self._integrator == "rk4":
                 return False
-            if isinstance(change, PushChange) and not self._follows_motion:
+            if isinstance(change, PushChange) and not self._has_forces:
                 return False
         return True
 
@@ -579,60 +587,59 @@ class Plant:
             scheduled.append((step, change))
         return scheduled
 
-    def _change(self) -> None:
-        """Apply the changes due before the next step."""
-        if not (self._pending and self._pending[0][0] <= self._step):
-            return
+    def _apply_due_changes(self) -> None:
+        """Apply the changes that are due before the next step."""
+        applied = False
         while self._pending and self._pending[0][0] <= self._step:
             _, change = self._pending.popleft()
-            if isinstance(change, RotorChange):
-                self._efficiency[change.rotor - 1] = change.efficiency
-            elif isinstance(change, MassChange):
-                self._carry(self._payloads, change.factor)
-            elif isinstance(change, LagChange):
-                self._rotors = self._rotors.lagging(change)
-            elif isinstance(change, PushChange):
-                pushes = []
-                for push in change.pushes:
-                    if any(push.force):
-                        pushes.append((*push.force, *push.point))
-                self._pushes = np.array(pushes, float).reshape(-1, 6)
-            elif isinstance(change, Payload):
-                self._carry((*self._payloads, change), self._mass_factor)
-            elif isinstance(change, PayloadDrop):
-                self._carry((), self._mass_factor)
-            else:
-                assert_never(change)
-        self._tell()
+            self._apply(change)
+            applied = True
+        if applied:
+            self._write_changes()
 
-    def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
+    def _apply(self, change: Change) -> None:
+        """Apply a change; `_write_changes` then tells the core."""
+        if isinstance(change, RotorChange):
+            self._efficiency[change.rotor - 1] = change.efficiency
+        elif isinstance(change, LagChange):
+            self._rotors = self._rotors.lagging(change)
+        elif isinstance(change, PushChange):
+            pushes = []
+            for push in change.pushes:
+                if any(push.force):
+                    pushes.append((*push.force, *push.point))
+            self._pushes = np.array(pushes, float).reshape(-1, 6)
+        elif isinstance(change, MassChange):
+            self._set_load(self._payloads, change.factor)
+        elif isinstance(change, Payload):
+            self._set_load((*self._payloads, change), self._mass_factor)
+        elif isinstance(change, PayloadDrop):
+            self._set_load((), self._mass_factor)
+        else:
+            assert_never(change)
+
+    def _set_load(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
+        """Give the vehicle the mass properties with these payloads, and with its own mass times a factor."""
         self._payloads = payloads
         self._mass_factor = mass_factor
         load = replace(self._load, mass_factor=mass_factor)
         properties = mass_properties(self.vehicle, load, payloads)
         if self._integrator == "rk4":
-            _weigh(self._struct, properties.mass, properties.inertia)
+            _set_mass(self._struct, properties.mass, properties.inertia)
         else:
             apply_mass(self.model, BODY, properties)
 
-    def _own_wrench(self) -> Array:
+    def _user_wrench(self) -> Array:
         """Return the sum (6,) of the user-defined forces now, world [N] and body frame [N m].
 
         Raises:
             ForceError: a force is not six finite numbers.
             RaisedError: a force raised an exception.
         """
-        time = self.time
         total = np.zeros(6)
         state = physics_to_state(self.physics[None])[0]
-        for force in self._own:
-            name = getattr(force, "__name__", type(force).__name__)
-            with user_code(lambda error, name=name: RaisedError(f"the force {name}", error, time=time)):  # type: ignore[misc]
-                wrench = numbers_of(force(time, state.copy()))
-            if wrench.shape != (6,) or not np.all(np.isfinite(wrench)):
-                shown = f"{wrench.tolist()!r:.80}"
-                raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {shown}", time=time)
-            total += wrench
+        for force in self._user_forces:
+            total += _wrench_of(force, self.time, state.copy())
         return total
 
     def _check_warnings(self) -> None:
@@ -688,12 +695,77 @@ def check_free(effects: Effects, changes: Sequence[Change], obstacles: Sequence[
         raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(unknown)}")
 
 
-def _weigh(v: Struct, mass: float, inertia: Array) -> None:
+def _wrench_of(force: Force, time: float, state: Array) -> Array:
+    """Return the wrench (6,) of a user-defined force at a time [s] and a state (12,).
+
+    Raises:
+        ForceError: it is not six finite numbers.
+        RaisedError: the force raised an exception.
+    """
+    name = getattr(force, "__name__", type(force).__name__)
+    with user_code(lambda error: RaisedError(f"the force {name}", error, time=time)):
+        wrench = numbers_of(force(time, state))
+    if wrench.shape != (6,) or not np.all(np.isfinite(wrench)):
+        shown = f"{wrench.tolist()!r:.80}"
+        raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {shown}", time=time)
+    return wrench
+
+
+def _set_mass(v: Struct, mass: float, inertia: Array) -> None:
     """Give the core's own method a mass [kg] and an inertia (3, 3) [kg m^2] about the body's origin."""
     v.mass = mass
     v.inertia[:] = np.diagonal(inertia)
     v.products[:] = inertia[0, 1], inertia[0, 2], inertia[1, 2]
     fill(v.inverse, np.linalg.inv(inertia))
+
+
+def _set_rotors(v: Struct, vehicle: Vehicle) -> None:
+    """Give the core the rotors: their places, their thrust a_1 w + a_2 w^2, and the power that they take.
+
+    A rotor's power is its torque times its speed, proportional to (a_1 w + a_2 w^2) w.  The core computes it with w in
+    units of the hover speed, and relative to the mean rotor's power in hover.
+    """
+    v.linear, quadratic = vehicle.thrust_law
+    v.coefficient[:] = quadratic
+    v.spin[:] = np.array(vehicle.rotor_spins, float)
+    fill(v.place, vehicle.hubs)
+    fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
+    v.hover = vehicle.hover_speed
+    ratios = vehicle.hover_speeds / vehicle.hover_speed
+    mean = vehicle.mean_coefficient
+    power = quadratic / mean
+    linear_power = v.linear / (mean * vehicle.hover_speed)
+    total = float(power @ ratios**3) + linear_power * float((ratios**2).sum())
+    v.demand[:] = N_ROTORS * power / total
+    v.linear_demand = N_ROTORS * linear_power / total
+
+
+def _set_air(v: Struct, air: Air) -> None:
+    """Give the core the coefficients of drag and of the moments of the air."""
+    v.rotor_drag = air.rotor_drag or 0.0
+    v.rotor_moment[:] = air.rotor_moment or (0.0, 0.0)
+    v.rate_damping[:] = air.rate_damping or (0.0, 0.0, 0.0)
+    v.inflow = air.inflow or 0.0
+    v.linear_drag[:] = air.linear_drag
+    v.quadratic_drag[:] = air.quadratic_drag
+    if air.inflow_moment is not None:
+        by_mujoco = (0.0, 0.0)
+        if air.body_drag is not None:  # MuJoCo's ellipsoid already gives a part of the moment
+            by_mujoco = munk_moment(air.body_drag, air.density)
+        v.inflow_moment[:] = np.subtract(air.inflow_moment, by_mujoco)
+
+
+def _set_battery(v: Struct, battery: Battery, curve: Array) -> None:
+    """Give the core a battery, with its curve (P, 2) of charge [-] and cell voltage [V]."""
+    v.curve = curve.ctypes.data
+    v.points = len(curve)
+    v.cells = battery.cells
+    v.capacity = battery.capacity
+    v.resistance = battery.resistance
+    v.hover_current = battery.hover_current
+    v.idle_current = battery.idle_current
+    v.reference_voltage = battery.reference_voltage
+    v.exponent = battery.exponent
 
 
 def _discard(message: str) -> None:
