@@ -465,7 +465,7 @@ static void put_desired(quadsim_mpc *mpc, const real *reference, real turns, rea
 static void put_speeds(const quadsim_problem *p, const real *speeds, real *state)
 {
     int j;
-    for (j = 0; j < p->speeds; j++) {
+    for (j = 0; j < p->rotor_states; j++) {
         state[12 + j] = speeds[j];
     }
 }

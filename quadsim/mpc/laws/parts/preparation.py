@@ -69,7 +69,7 @@ class RobustPreparation:
             horizon=problem.horizon,
             states=problem.model.n,
             regulated=len(self._C_r),
-            speeds=rotor_states(problem),
+            rotor_states=rotor_states(problem),
             C_r=self._C_r.ctypes.data,
         )
         self._controller = struct("quadsim_controller")(
