@@ -381,7 +381,7 @@ static void take_sample(quadsim_sensor *s, int64_t j, const double *motion)
 {
     double *value = s->values + 3 * (j - s->first), turned[4];
     const double *truth = motion + COLUMN[s->kind];
-    const int fate = s->fate[j - s->first];
+    const int faults = s->faults[j - s->first];
     if (s->kind == ATTITUDE) {
         exponential(value, turned);
         multiply(truth, turned, turned);
@@ -391,14 +391,14 @@ static void take_sample(quadsim_sensor *s, int64_t j, const double *motion)
             value[i] += truth[i];
         }
     }
-    if ((fate & FROZEN) && s->passed) {
+    if ((faults & FROZEN) && s->passed) {
         memcpy(value, s->through, sizeof s->through);
-    } else if (!(fate & LOST)) {
+    } else if (!(faults & LOST)) {
         memcpy(s->through, value, sizeof s->through);
         s->passed = 1;
     }
     for (int i = 0; i < 3; i++) {
-        value[i] = fate & (NO_NUMBER << i) ? NAN : value[i];
+        value[i] = faults & (NO_NUMBER << i) ? NAN : value[i];
     }
 }
 
@@ -431,7 +431,7 @@ void quadsim_hear(quadsim_sensing *sensed, int64_t now, const double *motion)
     for (int64_t k = 0; k < sensed->count; k++) {
         quadsim_sensor *s = sensed->sensors + k;
         for (; s->heard * s->stride + s->latency <= now; s->heard++) {
-            if (!(s->fate[s->heard - s->first] & LOST)) {
+            if (!(s->faults[s->heard - s->first] & LOST)) {
                 memcpy(s->held, s->values + 3 * (s->heard - s->first), sizeof s->held);
             }
         }

@@ -93,7 +93,7 @@ typedef struct quadsim_inner {
 typedef struct quadsim_sensor {
     int64_t kind, stride, latency, first, heard; /* heard: the next sample to be heard */
     double *values;                              /* [n][3] errors come in, samples go out */
-    const uint8_t *fate;                         /* [n] of LOST, FROZEN, and NO_NUMBER << axis */
+    const uint8_t *faults;                       /* [n] sums of LOST, FROZEN, and NO_NUMBER << axis */
     double held[3], through[3];                  /* the sample heard last; the one that a frozen sensor repeats */
     int64_t passed;                              /* whether `through` is a sample */
 } quadsim_sensor;

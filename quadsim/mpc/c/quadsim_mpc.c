@@ -332,11 +332,10 @@ static void update_trim(quadsim_mpc *mpc)
     }
 }
 
-/* The velocity of a state along axes that are turned about world z by a yaw with this sine and cosine, or the position
- * where `first` is X. */
-static void into_heading_axes(const real *state, int first, real sine, real cosine, real *along_x, real *along_y)
+/* The components of a horizontal vector along axes that are turned about world z by an angle with this sine and
+ * cosine. */
+static void into_turned_axes(real x, real y, real sine, real cosine, real *along_x, real *along_y)
 {
-    const real x = state[first], y = state[first + 2];
     *along_x = cosine * x + sine * y;
     *along_y = cosine * y - sine * x;
 }
@@ -357,7 +356,7 @@ static void air_beyond_hover(const quadsim_mpc *mpc, const real *state, real bey
     along[1] = state[VY];
     along[2] = R(0.0);
     if (r->heading) {
-        into_heading_axes(state, VX, s[2], k[2], &along[0], &along[1]);
+        into_turned_axes(state[VX], state[VY], s[2], k[2], &along[0], &along[1]);
     }
     for (i = 0; i < 3; i++) {
         euler_rates[i] = state[ROLL + 1 + 2 * i];
@@ -395,24 +394,25 @@ static void update_rest_command(quadsim_mpc *mpc, const real *ahead)
     }
 }
 
-/* Update the disturbance from a measured state and the one that was expected.  Of a vertical surprise, the thrust axis
- * has what lies along it: the vertical part over the cosine of the tilt. */
+/* Update the disturbance from the innovation, the difference of a measured state and the one that was expected.  Of
+ * velocities, the vertical difference is taken to be that along the thrust axis, over the cosine of the tilt; what that
+ * leaves of the horizontal differences is along world x and y. */
 static void observe_state(quadsim_mpc *mpc, const real *measured, const real *expected)
 {
     const quadsim_robust *r = mpc->controller->robust;
-    real axis[3], rates[3], expected_rates[3], surprise[6], upright;
+    real axis[3], rates[3], expected_rates[3], innovation[6], upright;
     int i;
     thrust_axis_at(measured, axis);
     body_rates(measured, rates);
     body_rates(expected, expected_rates);
     upright = axis[2] > r->upright ? axis[2] : r->upright;
-    surprise[2] = (measured[VZ] - expected[VZ]) / upright;
-    surprise[0] = (measured[VX] - expected[VX]) - surprise[2] * axis[0];
-    surprise[1] = (measured[VY] - expected[VY]) - surprise[2] * axis[1];
+    innovation[2] = (measured[VZ] - expected[VZ]) / upright;
+    innovation[0] = (measured[VX] - expected[VX]) - innovation[2] * axis[0];
+    innovation[1] = (measured[VY] - expected[VY]) - innovation[2] * axis[1];
     for (i = 0; i < 3; i++) {
-        surprise[3 + i] = rates[i] - expected_rates[i];
+        innovation[3 + i] = rates[i] - expected_rates[i];
     }
-    update_disturbance(r->gain, r->largest, surprise, mpc->estimate);
+    update_disturbance(r->gain, r->largest, innovation, mpc->estimate);
     update_trim(mpc);
 }
 
@@ -459,14 +459,6 @@ static void later_rates(const quadsim_controller *c, const real *reference, int 
     }
 }
 
-/* Turn the first two numbers of a row, along world x and y, into axes that are turned by an angle about world z. */
-static void turn_axes(real row[4], real sine, real cosine)
-{
-    const real x = row[0], y = row[1];
-    row[0] = cosine * x + sine * y;
-    row[1] = cosine * y - sine * x;
-}
-
 /* y_d of the reference [N][4]: later by the delay, and where the model is turned by the heading, in axes turned by it,
  * with yaw as distance from the present one, in steps of at most the largest turn.  Rows that are past when the command
  * acts are passed over, and the last row is held. */
@@ -491,14 +483,14 @@ static void put_desired(quadsim_mpc *mpc, const real *reference, real turns, rea
             const real step = row[3] - yaw_before;
             yaw_before = row[3];
             limited_yaw += clipped(step, -robust->largest_turn, robust->largest_turn);
-            turn_axes(row, sine, cosine);
+            into_turned_axes(row[0], row[1], sine, cosine, &row[0], &row[1]);
             row[3] = limited_yaw - yaw;
         }
         put_desired_pose(c->problem, row, desired);
         if (c->follows_rates) {
             later_rates(c, reference, at, rates);
             if (robust->heading) {
-                turn_axes(rates, sine, cosine);
+                into_turned_axes(rates[0], rates[1], sine, cosine, &rates[0], &rates[1]);
             }
             add_desired_rates(c->problem, rates, desired);
         }
@@ -532,8 +524,8 @@ static void put_query(quadsim_mpc *mpc, const real *ahead, const real *reference
     if (c->robust->heading) {
         mpc->yaw = ahead[YAW];
         sin_cos(ahead[YAW], &sine, &cosine);
-        into_heading_axes(ahead, X, sine, cosine, &state[X], &state[Y]);
-        into_heading_axes(ahead, VX, sine, cosine, &state[VX], &state[VY]);
+        into_turned_axes(ahead[X], ahead[Y], sine, cosine, &state[X], &state[Y]);
+        into_turned_axes(ahead[VX], ahead[VY], sine, cosine, &state[VX], &state[VY]);
         state[YAW] = R(0.0);
     }
     put_speeds(c->problem, mpc->rotors_ahead, state);

@@ -341,7 +341,7 @@ def renumbered(slack: Indices) -> Indices:
 
 @dataclass(frozen=True)
 class _Stack:
-    """The rows of all constraints one below the other, in the constraints' units; members as in `Rows`."""
+    """Rows of one or more constraints one below the other, in the constraints' units; members as in `Rows`."""
 
     C: Array
     D: Array
@@ -356,7 +356,7 @@ class _Stack:
 
 def stacked_rows(constraints: Sequence[Constraint], *, horizon: int, n: int, nu: int) -> Rows:
     """Return the normalised rows of constraints on a model of n states and nu inputs."""
-    stack = _stacked(constraints, horizon, n, nu)
+    stack = _stacked(_parts(constraints, horizon, n, nu))
     scale = _shared_scale(stack)
     column = scale[:, None]
     C = stack.C * column
@@ -386,49 +386,54 @@ def stacked_rows(constraints: Sequence[Constraint], *, horizon: int, n: int, nu:
     )
 
 
-def _stacked(constraints: Sequence[Constraint], horizon: int, n: int, nu: int) -> _Stack:
-    """Return the rows of all constraints; C is (N, m, n) if rows of any constraint differ from step to step."""
+def _parts(constraints: Sequence[Constraint], horizon: int, n: int, nu: int) -> list[_Stack]:
+    """Return each constraint's rows; C is (N, m, n) for all if rows of any constraint differ from step to step."""
     steps: tuple[int, ...] = ()
-    if any(part.C is not None and part.C.ndim == 3 for part in constraints):
+    if any(constraint.C is not None and constraint.C.ndim == 3 for constraint in constraints):
         steps = (horizon,)
-    on_states = []
-    on_inputs = []
-    on_moves = []
-    lowers = []
-    uppers = []
-    linear = []
-    quadratic = []
-    slacks = []
-    names: list[str] = []
-    for part in constraints:
-        m = part.lower.shape[-1]
-        on_states.append(_broadcast(part.C, (*steps, m, n)))
-        on_inputs.append(_broadcast(part.D, (m, nu)))
-        on_moves.append(_broadcast(part.E, (m, nu)))
-        lowers.append(np.broadcast_to(part.lower, (horizon, m)))
-        uppers.append(np.broadcast_to(part.upper, (horizon, m)))
-        l1, l2, slack = _softness(part, first_row=len(names))
-        linear.append(l1)
-        quadratic.append(l2)
-        slacks.append(slack)
-        names += [part.name] * m
+    parts = []
+    first_row = 0
+    for constraint in constraints:
+        m = constraint.lower.shape[-1]
+        l1, l2, slack = _softness(constraint, first_row)
+        part = _Stack(
+            C=_broadcast(constraint.C, (*steps, m, n)),
+            D=_broadcast(constraint.D, (m, nu)),
+            E=_broadcast(constraint.E, (m, nu)),
+            lower=np.broadcast_to(constraint.lower, (horizon, m)),
+            upper=np.broadcast_to(constraint.upper, (horizon, m)),
+            l1=l1,
+            l2=l2,
+            slack=slack,
+            names=[constraint.name] * m,
+        )
+        parts.append(part)
+        first_row += m
+    return parts
+
+
+def _stacked(parts: Sequence[_Stack]) -> _Stack:
+    """Return the rows of all parts, one below the other."""
+    names = []
+    for part in parts:
+        names += part.names
     return _Stack(
-        C=np.concatenate(on_states, axis=-2),
-        D=np.concatenate(on_inputs, axis=-2),
-        E=np.concatenate(on_moves, axis=-2),
-        lower=np.concatenate(lowers, axis=1),
-        upper=np.concatenate(uppers, axis=1),
-        l1=np.concatenate(linear),
-        l2=np.concatenate(quadratic),
-        slack=np.concatenate(slacks),
+        C=np.concatenate([part.C for part in parts], axis=-2),
+        D=np.concatenate([part.D for part in parts], axis=-2),
+        E=np.concatenate([part.E for part in parts], axis=-2),
+        lower=np.concatenate([part.lower for part in parts], axis=1),
+        upper=np.concatenate([part.upper for part in parts], axis=1),
+        l1=np.concatenate([part.l1 for part in parts]),
+        l2=np.concatenate([part.l2 for part in parts]),
+        slack=np.concatenate([part.slack for part in parts]),
         names=names,
     )
 
 
 def _softness(part: Constraint, first_row: int) -> tuple[Array, Array, Indices]:
-    """Return l1, l2 and the slack (m,) of a constraint's rows, of which the first has a number among all rows.
+    """Return l1, l2 and slacks (m,) of a constraint's rows, the first of which is number `first_row` of all.
 
-    A slack has the number of the first row that it is of, so that numbers have gaps: see `renumbered`.
+    A slack has the number of its first row.  Such numbers have gaps, which `renumbered` closes.
     """
     m = part.lower.shape[-1]
     if part.penalty is None:
