@@ -245,8 +245,9 @@ static void predict_under_targets(const quadsim_mpc *mpc, real time, const real 
     }
 }
 
-/* The state some time [s] later under a command, by Runge-Kutta's classical method; `decay` [SUBSTEPS][4]
- * has what is left of the rotors' distance from the command at its instants, `answer` see above. */
+/* The state some time [s] later under a command, by Runge-Kutta's classical method.  `decay` [SUBSTEPS][4] has the
+ * share that is left of the rotors' distance from the command at the instants of its stages; `answer` is what
+ * predict_under_targets takes where the command is of targets. */
 static void predict_vehicle(const quadsim_mpc *mpc, real time, const real *decay, const real *answer,
                             const real *rotors, const real *command, real *state)
 {

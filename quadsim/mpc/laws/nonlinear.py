@@ -94,12 +94,10 @@ class Weights:
             if name in ("input", "move"):
                 shapes = ((),)
                 rule = "one positive number"
-            is_valid = weights.shape in shapes and bool(np.isfinite(weights).all())
+            in_range = weights > 0.0
             if name == "move":
-                is_valid = is_valid and bool((weights >= 0.0).all())
-            else:
-                is_valid = is_valid and bool((weights > 0.0).all())
-            if not is_valid:
+                in_range = weights >= 0.0
+            if weights.shape not in shapes or not (in_range & np.isfinite(weights)).all():
                 raise ParameterError("controller.weights", name, value, rule)
             if weights.ndim:
                 object.__setattr__(self, name, tuple(weights.tolist()))
