@@ -179,7 +179,8 @@ def export(
     """Write a scenario's controller as self-contained C99, with the periods of the scenario's flight as test vectors.
 
     The same scenario gives the same bytes.  No compiler is needed; `make -C DIR check` then compiles it and runs the
-    recorded periods.  `export.json` has its memory, and how far from the reference its room for active rows suffices.
+    recorded periods.  `export.json` has its memory, and how far from the reference its capacity for active rows is
+    enough.
 
     Args:
         scenario: it, or its name or file.
@@ -297,7 +298,9 @@ def memory_sentence(facts: Mapping[str, Any]) -> str:
     """Return the memory, and the distance from the reference up to which its capacity for active rows suffices."""
     if "rows" not in facts:
         return f"{facts['memory_bytes']} bytes of memory"
-    return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
+    return (
+        f"capacity for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
+    )
 
 
 def programs(controller: CSource, target: Machine) -> dict[str, str]:
@@ -354,7 +357,7 @@ def _readme(scenario: Scenario, controller: CSource, memory: str) -> str:
         warm = ""
     else:
         kind = "model predictive"
-        facts = "what it takes, and how far its room for active rows suffices"
+        facts = "what it takes, and how far its capacity for active rows suffices"
         warm = WARM
     further = []
     for name in (*controller.law_files, *BODY_FILES):
