@@ -20,7 +20,7 @@ from quadsim.state import INDEX, N_STATES, STATE_NAMES, STATE_UNITS, Array, Indi
 
 _INPUTS: Final = "controller.input_bounds"
 Price = Annotated[float, Ge(0.0), Le(1e12)]
-Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
+RowFlags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 class Origin(NamedTuple):
@@ -283,7 +283,7 @@ class Rows:
     l2: Array  # (m,) quadratic penalty of a normalised row
     slack: Indices  # (m,) index of a soft row's slack within its step; -1 for hard rows
     # (m,) whether a row is of states alone: its entry i is then for x(k+i+1), otherwise for x(k+i) and u(k+i)
-    of_states: Flags
+    of_states: RowFlags
     input: Indices  # (m,) which input a hard row bounds, if it bounds nothing else; -1 otherwise
     step: Indices  # (m,) which input's step u(k+i) - u(k+i-1) a hard row bounds, if nothing else; -1 otherwise
     names: tuple[str, ...]  # (m,) names of their constraints
@@ -294,7 +294,7 @@ class Rows:
         return self.scale[self.slacks]
 
     @cached_property
-    def on_states(self) -> Flags:
+    def on_states(self) -> RowFlags:
         """Return (m,) whether a row involves states, alone or not."""
         return _involves_states(self.C).reshape(len(self.D))
 
@@ -470,7 +470,7 @@ def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
     return np.asarray(np.maximum(of_states, of_inputs))
 
 
-def _involves_states(C: Array) -> Flags:
+def _involves_states(C: Array) -> RowFlags:
     """Return (m,) whether rows of C (m, n) or (N, m, n) involve a state."""
     if C.ndim == 3:
         return np.asarray(C.any(axis=(0, 2)))

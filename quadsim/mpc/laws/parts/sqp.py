@@ -13,7 +13,7 @@ import numpy as np
 
 from quadsim.core.mirror import Struct, constant, set_members, struct
 from quadsim.errors import ParameterError
-from quadsim.mpc.laws.parts.body import MOST_STATES, ProblemStruct, body_numbers
+from quadsim.mpc.laws.parts.body import MOST_BODY_STATES, ProblemStruct, body_numbers
 from quadsim.mpc.problem.constraints import Constraint
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.problem.rigidbody import P, RigidBody, V
@@ -171,7 +171,7 @@ def nonlinear_program(
         move=problem.objective.move_weight[0, 0],
     )
     size = model.n + N_ROTORS * moves
-    weights = np.zeros(MOST_STATES)
+    weights = np.zeros(MOST_BODY_STATES)
     terminal = np.zeros((size, size))
     weights[: model.n] = np.diag(problem.objective.weights[0])[: model.n]
     terminal[: model.n, : model.n] = problem.objective.terminal_weights[0][: model.n, : model.n]
