@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le, doc
@@ -20,7 +20,7 @@ from quadsim.state import INDEX, N_STATES, STATE_NAMES, STATE_UNITS, Array, Indi
 
 _INPUTS: Final = "controller.input_bounds"
 Price = Annotated[float, Ge(0.0), Le(1e12)]
-RowFlags = np.ndarray[tuple[int], np.dtype[np.bool_]]
+RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 class Origin(NamedTuple):
