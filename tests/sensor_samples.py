@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from quadsim.core.mirror import core_library
-from quadsim.core.structs import SAMPLE, Fate
+from quadsim.core.structs import SAMPLE, SampleFault
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import steps_type
 from quadsim.sim.sensing import KINDS, Sampler, Sensor, SensorFault, SensorName, truth
@@ -25,7 +25,7 @@ def sampler_of(
 def taken(sampler: Sampler, physics: Array) -> NDArray[np.void]:
     """The samples of a motion (M, 14) from its start, without lost ones: an independent version of the core's."""
     steps = np.arange(0, len(physics), sampler.stride)
-    errors, fates = sampler.draw(0, len(steps))
+    errors, sample_faults = sampler.draw(0, len(steps))
     rows = physics[steps]
     if sampler.name is SensorName.ATTITUDE:
         turned = Rotation.from_quat(rows[:, 4:8], scalar_first=True) * Rotation.from_rotvec(errors)
@@ -33,17 +33,17 @@ def taken(sampler: Sampler, physics: Array) -> NDArray[np.void]:
     else:
         values = truth(sampler.name, rows) + errors
     through = None
-    for value, fate in zip(values, fates, strict=True):
-        if fate & Fate.FROZEN and through is not None:
+    for value, faults in zip(values, sample_faults, strict=True):
+        if faults & SampleFault.FROZEN and through is not None:
             value[:] = through
-        elif not fate & Fate.LOST:
+        elif not faults & SampleFault.LOST:
             through = value.copy()
-        value[[bool(fate & Fate.NO_NUMBER << axis) for axis in range(3)]] = np.nan
+        value[[bool(faults & SampleFault.NO_NUMBER << axis) for axis in range(3)]] = np.nan
     samples = np.empty(len(steps), SAMPLE)
     samples["taken"] = steps
     samples["kind"] = KINDS[sampler.name]
     samples["value"] = values
-    return samples[fates & Fate.LOST == 0]
+    return samples[sample_faults & SampleFault.LOST == 0]
 
 
 def follow(navigation: Navigation, physics: Array, commands: Array, first: int, *, on_ground: bool = False) -> None:

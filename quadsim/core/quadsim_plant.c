@@ -470,7 +470,7 @@ static void take_sample(quadsim_sensor *s, int64_t j, const double *motion)
 {
     double *value = s->values + 3 * (j - s->first);
     const double *truth = motion + START[s->kind];
-    const int fate = s->fate[j - s->first];
+    const int faults = s->faults[j - s->first];
     if (s->kind == ATTITUDE) { /* the error is a rotation vector, the sample Euler angles */
         double q[4];
         exponential(value, q);
@@ -481,14 +481,14 @@ static void take_sample(quadsim_sensor *s, int64_t j, const double *motion)
             value[i] += truth[i];
         }
     }
-    if ((fate & FROZEN) && s->passed) {
+    if ((faults & FROZEN) && s->passed) {
         memcpy(value, s->through, sizeof s->through);
-    } else if (!(fate & LOST)) {
+    } else if (!(faults & LOST)) {
         memcpy(s->through, value, sizeof s->through);
         s->passed = 1;
     }
     for (int i = 0; i < 3; i++) {
-        if (fate & (NO_NUMBER << i)) {
+        if (faults & (NO_NUMBER << i)) {
             value[i] = NAN;
         }
     }
@@ -519,7 +519,7 @@ static void hold_newest(quadsim_sensor *s, int64_t now)
 {
     while (s->heard * s->stride + s->latency <= now) {
         const int64_t place = s->heard - s->first;
-        if (!(s->fate[place] & LOST)) {
+        if (!(s->faults[place] & LOST)) {
             memcpy(s->held, s->values + 3 * place, sizeof s->held);
         }
         s->heard++;

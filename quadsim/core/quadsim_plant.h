@@ -128,12 +128,12 @@ typedef struct quadsim_inner {
 typedef struct quadsim_sensor {
     int64_t kind, stride, latency; /* in physics steps */
     int64_t first;
-    int64_t heard;       /* the next sample to be heard */
-    double *values;      /* [n][3] the errors of samples, which the samples replace */
-    const uint8_t *fate; /* [n] a sum of LOST, FROZEN, and NO_NUMBER << axis */
-    double held[3];      /* the sample heard last */
-    double through[3];   /* the sample that a frozen sensor repeats */
-    int64_t passed;      /* whether `through` is a sample */
+    int64_t heard;         /* the next sample to be heard */
+    double *values;        /* [n][3] the errors of samples, which the samples replace */
+    const uint8_t *faults; /* [n] a sum of LOST, FROZEN, and NO_NUMBER << axis */
+    double held[3];        /* the sample heard last */
+    double through[3];     /* the sample that a frozen sensor repeats */
+    int64_t passed;        /* whether `through` is a sample */
 } quadsim_sensor;
 
 enum { LOST = 1, FROZEN = 2, NO_NUMBER = 4 }; /* what happens to a sample */

@@ -29,8 +29,8 @@ class LoopKind(IntEnum):
     INDI = 2
 
 
-class Fate:
-    """What happens to a sensor's sample: a sum of these, as arrays of NumPy take them."""
+class SampleFault:
+    """What is wrong with a sensor's sample: a sum of these, of type int as arrays of NumPy need it."""
 
     LOST: Final = 1
     FROZEN: Final = 2

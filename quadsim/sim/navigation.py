@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadsim.core.mirror import Struct, core_library
-from quadsim.core.structs import SAMPLE, Fate, SensingStruct, SensorStruct
+from quadsim.core.structs import SAMPLE, SampleFault, SensingStruct, SensorStruct
 from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion
 from quadsim.sim.estimator import (
@@ -103,8 +103,8 @@ class Navigation:
         for k, (sampler, struct) in enumerate(zip(self._samplers, self._structs, strict=False)):
             sampler.reschedule(faults)
             taken = self._step // struct.stride + 1 - struct.first
-            values, fates = self._samples[k]
-            self._samples[k] = values[:taken], fates[:taken]
+            values, sample_faults = self._samples[k]
+            self._samples[k] = values[:taken], sample_faults[:taken]
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
@@ -211,7 +211,7 @@ class Navigation:
         self._prepared = stop
         for k, sampler in enumerate(self._samplers):
             struct = self._structs[k]
-            values, fates = self._samples[k]
+            values, sample_faults = self._samples[k]
             first = -(-start // struct.stride)
             end = -(-stop // struct.stride)
             heard = struct.heard
@@ -220,11 +220,11 @@ class Navigation:
             drop = max(min(heard, first) - struct.first, 0)
             errors, fresh = sampler.draw(first, end - first)
             values = np.concatenate([values[drop:], errors])
-            fates = np.concatenate([fates[drop:], fresh])
-            self._samples[k] = (values, fates)
+            sample_faults = np.concatenate([sample_faults[drop:], fresh])
+            self._samples[k] = (values, sample_faults)
             struct.first = struct.first + drop
             struct.values = values.ctypes.data
-            struct.fate = fates.ctypes.data
+            struct.faults = sample_faults.ctypes.data
 
     def _hear(self, step: int, physics: Array) -> None:
         """Hold the newest sample of each sensor to arrive by a physics step, at MuJoCo's state (14,)."""
@@ -234,7 +234,7 @@ class Navigation:
     def _arrived(self) -> list[NDArray[np.void]]:
         """Return the samples that have arrived since the last call, without lost ones."""
         arrived = []
-        for k, (values, fates) in enumerate(self._samples):
+        for k, (values, sample_faults) in enumerate(self._samples):
             struct = self._structs[k]
             passed = self._passed[k]
             last = (self._step - struct.latency) // struct.stride + 1
@@ -245,6 +245,6 @@ class Navigation:
             fresh["taken"] = struct.stride * np.arange(passed, last)
             fresh["kind"] = struct.kind
             fresh["value"] = values[rows]
-            arrived.append(fresh[fates[rows] & Fate.LOST == 0])
+            arrived.append(fresh[sample_faults[rows] & SampleFault.LOST == 0])
             self._passed[k] = last
         return arrived

@@ -17,7 +17,7 @@ import numpy as np
 from annotated_types import Ge, Le, Len, doc
 from numpy.typing import NDArray
 
-from quadsim.core.structs import Fate
+from quadsim.core.structs import SampleFault
 from quadsim.fields import Fraction, NonNegative, Number
 from quadsim.rotation import Vector3, quaternion_to_euler
 from quadsim.sim.physics import PHYSICS, whole
@@ -142,8 +142,8 @@ class SensorFault:
 
 
 SampleFlags = NDArray[np.bool_]
-Fates = NDArray[np.uint8]
-"""What happens to samples: sums of `Fate`s."""
+SampleFaults = NDArray[np.uint8]
+"""What is wrong with each sample: sums of `SampleFault`s."""
 StepIndices = NDArray[np.int64]
 
 
@@ -207,10 +207,10 @@ class Sampler:
         self._walked: Array | None = None
         self._first = 0  # of the samples whose draws are kept
         self._errors = np.empty((0, 3))
-        self._fates = np.empty(0, np.uint8)
+        self._sample_faults = np.empty(0, np.uint8)
 
-    def draw(self, first: int, count: int) -> tuple[Array, Fates]:
-        """Draw the errors (count, 3) of the samples from number `first` on, and what happens to each (count,).
+    def draw(self, first: int, count: int) -> tuple[Array, SampleFaults]:
+        """Draw the errors (count, 3) of the samples from number `first` on, and what is wrong with each (count,).
 
         An attitude's error is a rotation vector in the body frame.  Calls follow one another from sample 0; one may
         begin with any sample of the call before, for faults that have been rescheduled since.
@@ -218,17 +218,19 @@ class Sampler:
         past = first - self._first
         self._first = first
         self._errors = self._errors[past:]
-        self._fates = self._fates[past:]
+        self._sample_faults = self._sample_faults[past:]
         missing = count - len(self._errors)
         if missing > 0:
             errors = self._walk(missing) + self._draw_noise(missing) + 0.0  # turns -0 into 0
             lost = self._of_dropout.random(missing) < self._sensor.dropout
             self._errors = np.concatenate([self._errors, errors])
-            self._fates = np.concatenate([self._fates, lost.astype(np.uint8) * np.uint8(Fate.LOST)])
+            self._sample_faults = np.concatenate(
+                [self._sample_faults, lost.astype(np.uint8) * np.uint8(SampleFault.LOST)]
+            )
         errors = self._errors[:count].copy()
-        fates = self._fates[:count].copy()
+        sample_faults = self._sample_faults[:count].copy()
         if not self._faults:
-            return errors, fates
+            return errors, sample_faults
         taken = self.stride * np.arange(first, first + count)
         for fault, window in self._faults:
             within = _within(taken, window)
@@ -236,13 +238,13 @@ class Sampler:
                 case FaultKind.BIAS:
                     errors[within] += fault.offset
                 case FaultKind.DROPOUT:
-                    fates[within] |= Fate.LOST
+                    sample_faults[within] |= SampleFault.LOST
                 case FaultKind.FREEZE:
-                    fates[within] |= Fate.FROZEN
+                    sample_faults[within] |= SampleFault.FROZEN
                 case FaultKind.NAN:
                     for axis in fault.axes:
-                        fates[within] |= Fate.NO_NUMBER << axis
-        return errors, fates
+                        sample_faults[within] |= SampleFault.NO_NUMBER << axis
+        return errors, sample_faults
 
     def _walk(self, count: int) -> Array:
         """Return (count, 3) the bias at each sample: constant at the first of all, then a random walk."""

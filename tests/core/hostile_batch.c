@@ -21,7 +21,7 @@ typedef struct {
     quadsim_push push;
     double motion[MOTION], table[PERIOD][WIDTH], noise[PERIOD][ROTORS], disturbance[PERIOD][WRENCH];
     double queue[DELAY][ROTORS], samples[PERIOD + DELAY][3], curve[3][2], smallest[BOUNDS], at_end[BOUNDS];
-    uint8_t fate[PERIOD + DELAY];
+    uint8_t faults[PERIOD + DELAY];
 } craft;
 
 static quadsim_flight flights[COUNT];
@@ -101,7 +101,7 @@ static void start(craft *c, int kind)
     c->rows.thrust = c->table[0] + 22, c->rows.wrench = c->table[0] + 23, c->rows.battery = c->table[0] + 29;
     c->rows.width = WIDTH;
     c->sensor.kind = RATES, c->sensor.stride = 1, c->sensor.latency = DELAY - 1;
-    c->sensor.values = c->samples[0], c->sensor.fate = c->fate;
+    c->sensor.values = c->samples[0], c->sensor.faults = c->faults;
     c->sensing.sensors = &c->sensor, c->sensing.count = 1, c->sensing.attitude[0] = 1.0;
     c->loop.kind = AUTOPILOT, c->loop.stride = 1 + kind % 2, c->loop.measures = 1, c->loop.step = 1e-3;
     c->loop.gyro_share = 0.5, c->loop.d_share = 0.3, c->loop.airmode = kind % 3 != 1;
@@ -155,7 +155,7 @@ static void provoke(int k)
         c->sensor.heard = c->sensor.first;
     }
     copy->sensor = c->sensor;
-    copy->sensor.values = copy->samples[0], copy->sensor.fate = copy->fate;
+    copy->sensor.values = copy->samples[0], copy->sensor.faults = copy->faults;
     memcpy(copy->disturbance, c->disturbance, sizeof c->disturbance);
     memcpy(copy->noise, c->noise, sizeof c->noise);
 }

@@ -13,7 +13,7 @@ from quadsim.core import mirror
 from quadsim.core.build import FOLDERS, LIBRARY, ROOT, sources
 from quadsim.core.headers import Declarations, read_headers
 from quadsim.core.mirror import check_layout, constant, core_library, declare, make_structs, set_members, struct
-from quadsim.core.structs import End, Fate, LoopKind
+from quadsim.core.structs import End, LoopKind, SampleFault
 from quadsim.errors import FileError
 from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION
@@ -171,8 +171,8 @@ def test_enumerations_are_those_of_the_headers() -> None:
         assert constant(f"QUADSIM_{end.name}") == end
     for kind in LoopKind:
         assert constant(kind.name) == kind
-    for fate in ("LOST", "FROZEN", "NO_NUMBER"):
-        assert constant(fate) == getattr(Fate, fate)
+    for fault in ("LOST", "FROZEN", "NO_NUMBER"):
+        assert constant(fault) == getattr(SampleFault, fault)
     for method in Method:
         assert constant(f"QUADSIM_FOUND_{method.name}") == method
     for status in SQPStatus:

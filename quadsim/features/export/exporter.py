@@ -88,7 +88,7 @@ class LinearSearch:
         self._library = core_library()
         self._shared = CoreProblem(problem)  # has the arrays that the struct points to
         self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
-        self._struct.room = capacity or self._struct.room
+        self._struct.capacity = capacity or self._struct.capacity
         self._struct.changes = changes or self._struct.changes
         self._work = WorkStruct()
         self._memory = np.zeros(self._library.quadsim_work_reals(self._struct))
@@ -119,7 +119,7 @@ def nonlinear_search(controller: CNonlinear, capacity: int, changes: int) -> Sol
     law = replace(controller).law
     program = law.program.struct
     hover = law.problem.model.u_bar
-    law.resize(capacity or program.room, changes or program.changes)
+    law.resize(capacity or program.capacity, changes or program.changes)
     states = np.zeros((program.horizon + 1, N_BODY))
     thrusts = np.tile(np.array(law.numbers.lifts), (program.horizon, 1))
     states[:, 3] = 1.0

@@ -23,7 +23,7 @@ enum quadsim_status {
     QUADSIM_WHOLE = QUADSIM_FOUND_WHOLE, /* the optimum of the whole problem */
     QUADSIM_PRIMAL_INFEASIBLE = QUADSIM_FOUND_INFEASIBLE,
     QUADSIM_MAX_ITERATIONS = QUADSIM_FOUND_GAVE_UP, /* the search took as many changes as it may */
-    QUADSIM_NO_ROOM = QUADSIM_FOUND_NO_ROOM,        /* for as many active rows */
+    QUADSIM_NO_ROOM = QUADSIM_FOUND_OVER_CAPACITY,  /* the search needed more active rows than the capacity */
     QUADSIM_INVALID_DATA = QUADSIM_FOUND_INVALID,   /* numbers that are not finite, or implausible */
     QUADSIM_NOT_FINITE,                             /* the plan */
     QUADSIM_OUT_OF_BOUNDS,                          /* the plan's first command */

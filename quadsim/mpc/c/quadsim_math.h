@@ -357,12 +357,12 @@ static inline void lean_of(const real lift[3], real sine, real cosine, real *rol
  */
 
 /* Steady-state Kalman filters of six scalar disturbances, d += L (v - v expected), each within its limit. */
-static inline void update_disturbance(const real gain[6], const real largest[6], const real surprise[6],
+static inline void update_disturbance(const real gain[6], const real largest[6], const real innovation[6],
                                       real estimate[6])
 {
     int i;
     for (i = 0; i < 6; i++) {
-        estimate[i] = clipped(estimate[i] + gain[i] * surprise[i], -largest[i], largest[i]);
+        estimate[i] = clipped(estimate[i] + gain[i] * innovation[i], -largest[i], largest[i]);
     }
 }
 

@@ -30,8 +30,8 @@
 
 /* ---- desired outputs --------------------------------------------------------------------------------------------- */
 
-/* y_d [n_r] of a row of the reference. */
-static void put_places(const quadsim_problem *p, const real row[4], real *desired)
+/* y_d [n_r] = C_r times a row of the reference, at the entries of position and yaw. */
+static void put_desired_pose(const quadsim_problem *p, const real row[4], real *desired)
 {
     int r;
     for (r = 0; r < p->regulated; r++) {
@@ -40,8 +40,8 @@ static void put_places(const quadsim_problem *p, const real row[4], real *desire
     }
 }
 
-/* Add that of the velocities and the yaw rate of a row; roll, pitch and their rates are desired at 0. */
-static void add_rates(const quadsim_problem *p, const real rates[4], real *desired)
+/* Add C_r times the velocities and the yaw rate of a row to y_d; roll, pitch and their rates are desired to be 0. */
+static void add_desired_rates(const quadsim_problem *p, const real rates[4], real *desired)
 {
     int r;
     for (r = 0; r < p->regulated; r++) {
@@ -51,7 +51,7 @@ static void add_rates(const quadsim_problem *p, const real rates[4], real *desir
 }
 
 /* The reference's step from row i to the next, in yaw the shorter way round. */
-static void step_from(const real *reference, int i, real step[4])
+static void reference_step(const real *reference, int i, real step[4])
 {
     int j;
     for (j = 0; j < 4; j++) {
@@ -60,30 +60,31 @@ static void step_from(const real *reference, int i, real step[4])
     step[3] -= TURN * whole_turns(step[3]);
 }
 
-/* Velocities and yaw rate of the reference at row i: the mean of the steps before and after it, and at both ends those
- * of the parabola through three rows.  There are at least two rows. */
+/* Velocities and yaw rate of the reference at row i: inside, the mean of the steps before and after it; at both ends,
+ * those of the parabola through three rows, 3/2 of the near step less 1/2 of the next one.  There are at least two
+ * rows, and of two, both steps are the same one. */
 static void reference_rates(const quadsim_controller *c, const real *reference, int i, real rates[4])
 {
-    const int last = c->problem->horizon - 2; /* the last step */
-    const int second = last > 0 ? 1 : 0;
+    const int last_step = c->problem->horizon - 2;
+    const int neighbour = last_step > 0 ? 1 : 0;
     int near = i, other = i - 1, j;
     real share = R(0.5), near_step[4], other_step[4];
     if (i == 0) {
         share = R(1.5);
-        other = second;
-    } else if (i > last) {
+        other = neighbour;
+    } else if (i > last_step) {
         share = R(1.5);
-        near = last;
-        other = last - second;
+        near = last_step;
+        other = last_step - neighbour;
     }
-    step_from(reference, near, near_step);
-    step_from(reference, other, other_step);
+    reference_step(reference, near, near_step);
+    reference_step(reference, other, other_step);
     for (j = 0; j < 4; j++) {
         rates[j] = (share * near_step[j] + (R(1.0) - share) * other_step[j]) / c->period;
     }
 }
 
-/* Level rest at a state's place and yaw. */
+/* x_s: level and at rest at a state's position and yaw. */
 static void rest_at(const real *state, real *rest)
 {
     memset(rest, 0, QUADSIM_LAW_STATES * sizeof(real));
@@ -103,62 +104,63 @@ static void thrust_axis_at(const real *state, real axis[3])
     push_of(R(1.0), s, c, axis);
 }
 
-/* What the air takes from U/m and adds to the angular acceleration (3,), with a sum of the rotors' speeds. */
+/* What the air does at a state, where the speeds of all rotors add up to `speed`: it adds `angular` (3,) to the angular
+ * acceleration; returns what it takes from U/m. */
 static real air_effect(const quadsim_robust *robust, const real *state, real speed, const real *sine,
-                       const real *cosine, const real *rates, real turned[3])
+                       const real *cosine, const real *rates, real angular[3])
 {
     real velocity[3], along[3];
     velocity[0] = state[VX];
     velocity[1] = state[VY];
     velocity[2] = state[VZ];
     into_body_axes(velocity, sine, cosine, along);
-    turn_by_air(robust->across, robust->inflow, robust->damping, speed, along, rates, turned);
+    turn_by_air(robust->across, robust->inflow, robust->damping, speed, along, rates, angular);
     return robust->loss * speed * along[2];
 }
 
-/* Rates of change of a state, of U/m, I^-1 tau and the sum of the rotors' speeds (5,) and a constant acceleration (3,).
- * Sec. 2.2. */
+/* The rates of change of a state, Sec. 2.2, under `drive` (5,) = U/m, I^-1 tau and the sum of the rotors' speeds, and a
+ * constant acceleration `disturbance` (3,). */
 static void state_slopes(const quadsim_robust *robust, const real *state, const real *drive, const real *disturbance,
-                         real *rates)
+                         real *slopes)
 {
-    const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
-    real s[3], k[3], w[3], push[3], turned[3], thrust = drive[0], yaw;
+    const real roll_rate = state[ROLL + 1], pitch_rate = state[PITCH + 1], yaw_rate = state[YAW + 1];
+    real s[3], k[3], rates[3], push[3], angular[3], thrust = drive[0], yaw_slope; /* s, k: sines and cosines */
     int i;
     sines_of(state, s, k);
     for (i = 0; i < 12; i += 2) {
-        rates[i] = state[i + 1];
+        slopes[i] = state[i + 1];
     }
-    rates_of(state, s, k, w);
-    memcpy(turned, drive + 1, sizeof(turned));
-    add_gyroscopic(robust->gyration, w, turned);
+    rates_of(state, s, k, rates);
+    memcpy(angular, drive + 1, sizeof(angular));
+    add_gyroscopic(robust->gyration, rates, angular);
     if (robust->moment) {
         real by_air[3];
-        thrust -= air_effect(robust, state, drive[NU], s, k, w, by_air);
+        thrust -= air_effect(robust, state, drive[NU], s, k, rates, by_air);
         for (i = 0; i < 3; i++) {
-            turned[i] += by_air[i];
+            angular[i] += by_air[i];
         }
     }
     push_of(thrust, s, k, push);
-    yaw = (turned[1] * s[0] + turned[2] * k[0] + b * (a + c * s[1])) / k[1];
-    rates[VX] = push[0] + disturbance[0];
-    rates[VY] = push[1] + disturbance[1];
-    rates[VZ] = push[2] + (disturbance[2] - robust->gravity);
-    rates[ROLL + 1] = turned[0] + b * (c * k[1]) + s[1] * yaw;
-    rates[PITCH + 1] = turned[1] * k[0] - turned[2] * s[0] - a * (c * k[1]);
-    rates[YAW + 1] = yaw;
+    yaw_slope = (angular[1] * s[0] + angular[2] * k[0] + pitch_rate * (roll_rate + yaw_rate * s[1])) / k[1];
+    slopes[VX] = push[0] + disturbance[0];
+    slopes[VY] = push[1] + disturbance[1];
+    slopes[VZ] = push[2] + (disturbance[2] - robust->gravity);
+    slopes[ROLL + 1] = angular[0] + pitch_rate * (yaw_rate * k[1]) + s[1] * yaw_slope;
+    slopes[PITCH + 1] = angular[1] * k[0] - angular[2] * s[0] - roll_rate * (yaw_rate * k[1]);
+    slopes[YAW + 1] = yaw_slope;
 }
 
-/* result = state + time rates */
-static void state_after(const real *state, real time, const real *rates, real *result)
+/* result = state + time slopes */
+static void state_after(const real *state, real time, const real *slopes, real *result)
 {
     int i;
     for (i = 0; i < 12; i++) {
-        result[i] = state[i] + time * rates[i];
+        result[i] = state[i] + time * slopes[i];
     }
 }
 
-/* U/m, I^-1 tau and the sum of the speeds (5,) of rotors that have gone from rotors to command but for a share that
- * decays. */
+/* drive (5,) = U/m, I^-1 tau and the sum of the rotors' speeds, which follow a command: of their first distance from it
+ * the share `decay` is left. */
 static void find_drive(const quadsim_mpc *mpc, const real *rotors, const real *command, real decay, real *drive)
 {
     int i, j;
@@ -172,7 +174,7 @@ static void find_drive(const quadsim_mpc *mpc, const real *rotors, const real *c
     }
 }
 
-/* The acceleration (3,) that the estimated disturbance is, world axes, with thrust along an axis. */
+/* The estimated disturbance as an acceleration (3,) in world axes: its third component is along the thrust. */
 static void find_disturbance(const quadsim_mpc *mpc, const real axis[3], real acceleration[3])
 {
     acceleration[0] = mpc->estimate[2] * axis[0] + mpc->estimate[0];
@@ -180,7 +182,7 @@ static void find_disturbance(const quadsim_mpc *mpc, const real axis[3], real ac
     acceleration[2] = mpc->estimate[2] * axis[2];
 }
 
-/* Give a state the rates of Euler angles that body rates are. */
+/* Set the rates of the Euler angles of a state to those of body rates w. */
 static void put_body_rates(const real w[3], real *state)
 {
     real s[3], k[3], yaw;
@@ -191,41 +193,51 @@ static void put_body_rates(const real w[3], real *state)
     state[YAW + 1] = yaw;
 }
 
+/* The rates of change of a state under targets of an inner loop, in the stage of a step at which the inner loop's
+ * response is `answer` [6]; `at` gets the body rates w there, a w(0) + (1 - a - b) w_c.  The entries of the rates of
+ * Euler angles stay as they are: they are known, not integrated. */
+static void slopes_under_targets(const quadsim_robust *robust, const real *answer, const real *start,
+                                 const real *command, const real *disturbance, real *at, real w[3], real *slopes)
+{
+    real s[3], c[3], push[3];
+    int i;
+    for (i = 0; i < 3; i++) {
+        const real target = command[1 + i];
+        w[i] = target + answer[i] * (start[i] - target) - answer[3 + i] * target;
+    }
+    put_body_rates(w, at);
+    sines_of(at, s, c);
+    push_of(command[0] / robust->mass, s, c, push);
+    for (i = 0; i < 3; i++) {
+        slopes[2 * i] = at[2 * i + 1];
+        slopes[2 * i + 1] = push[i] + disturbance[i];
+        slopes[ROLL + 2 * i] = at[ROLL + 2 * i + 1];
+    }
+    slopes[VZ] -= robust->gravity;
+}
+
 /* The state some time [s] later under an inner loop's targets: place, velocity and attitude by Runge-Kutta's classical
  * method, body rates as `answer` [SUBSTEPS][4][6] has them at its instants. */
 static void predict_under_targets(const quadsim_mpc *mpc, real time, const real *answer, const real *command,
                                   real *state)
 {
-    static const real STAGE_TIME[4] = {R(0.0), R(0.5), R(0.5), R(1.0)},
-                      STAGE_WEIGHT[4] = {R(1.0), R(2.0), R(2.0), R(1.0)};
+    static const real STAGE_TIME[4] = {R(0.0), R(0.5), R(0.5), R(1.0)};
+    static const real STAGE_WEIGHT[4] = {R(1.0), R(2.0), R(2.0), R(1.0)};
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
-    real start[3], w[3], axis[3], disturbance[3], rates[12];
+    real start[3], w[3], axis[3], disturbance[3], slopes[12], at[12];
     int k, stage, i;
     thrust_axis_at(state, axis);
     find_disturbance(mpc, axis, disturbance);
     body_rates(state, start);
     for (k = 0; k < QUADSIM_SUBSTEPS; k++) {
         real sum[12] = {R(0.0)};
-        memset(rates, 0, sizeof(rates));
+        memset(slopes, 0, sizeof(slopes));
         for (stage = 0; stage < 4; stage++, answer += 6) {
-            real at[12], s[3], c[3], push[3];
-            state_after(state, STAGE_TIME[stage] * step, rates, at);
-            for (i = 0; i < 3; i++) {
-                const real target = command[1 + i];
-                w[i] = target + answer[i] * (start[i] - target) - answer[3 + i] * target;
-            }
-            put_body_rates(w, at);
-            sines_of(at, s, c);
-            push_of(command[0] / robust->mass, s, c, push);
-            for (i = 0; i < 3; i++) {
-                rates[2 * i] = at[2 * i + 1];
-                rates[2 * i + 1] = push[i] + disturbance[i];
-                rates[ROLL + 2 * i] = at[ROLL + 2 * i + 1];
-            }
-            rates[VZ] -= robust->gravity;
+            state_after(state, STAGE_TIME[stage] * step, slopes, at);
+            slopes_under_targets(robust, answer, start, command, disturbance, at, w, slopes);
             for (i = 0; i < 12; i++) {
-                sum[i] += STAGE_WEIGHT[stage] * rates[i];
+                sum[i] += STAGE_WEIGHT[stage] * slopes[i];
             }
         }
         state_after(state, step / R(6.0), sum, state);
@@ -233,14 +245,15 @@ static void predict_under_targets(const quadsim_mpc *mpc, real time, const real 
     }
 }
 
-/* The state some time [s] later under a command, by Runge-Kutta's classical method; decay [SUBSTEPS][4] of the rotors'
- * speeds at its instants. */
+/* The state some time [s] later under a command, by Runge-Kutta's classical method.  `decay` [SUBSTEPS][4] has the
+ * share that is left of the rotors' distance from the command at the instants of its stages; `answer` is what
+ * predict_under_targets takes where the command is of targets. */
 static void predict_vehicle(const quadsim_mpc *mpc, real time, const real *decay, const real *answer,
                             const real *rotors, const real *command, real *state)
 {
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
-    real axis[3], disturbance[3], drive[NU + 1], rates[4][12], at[12];
+    real axis[3], disturbance[3], drive[NU + 1], slopes[4][12], at[12];
     int k, i;
     if (!(time > R(1e-9))) {
         return;
@@ -253,32 +266,31 @@ static void predict_vehicle(const quadsim_mpc *mpc, real time, const real *decay
     find_disturbance(mpc, axis, disturbance);
     for (k = 0; k < QUADSIM_SUBSTEPS; k++, decay += 4) {
         find_drive(mpc, rotors, command, decay[0], drive);
-        state_slopes(robust, state, drive, disturbance, rates[0]);
+        state_slopes(robust, state, drive, disturbance, slopes[0]);
         find_drive(mpc, rotors, command, decay[1], drive);
-        state_after(state, R(0.5) * step, rates[0], at);
-        state_slopes(robust, at, drive, disturbance, rates[1]);
-        state_after(state, R(0.5) * step, rates[1], at);
-        state_slopes(robust, at, drive, disturbance, rates[2]);
+        state_after(state, R(0.5) * step, slopes[0], at);
+        state_slopes(robust, at, drive, disturbance, slopes[1]);
+        state_after(state, R(0.5) * step, slopes[1], at);
+        state_slopes(robust, at, drive, disturbance, slopes[2]);
         find_drive(mpc, rotors, command, decay[3], drive);
-        state_after(state, step, rates[2], at);
-        state_slopes(robust, at, drive, disturbance, rates[3]);
+        state_after(state, step, slopes[2], at);
+        state_slopes(robust, at, drive, disturbance, slopes[3]);
         for (i = 0; i < 12; i++) {
-            state[i] += step / R(6.0) * (rates[0][i] + R(2.0) * (rates[1][i] + rates[2][i]) + rates[3][i]);
+            state[i] += step / R(6.0) * (slopes[0][i] + R(2.0) * (slopes[1][i] + slopes[2][i]) + slopes[3][i]);
         }
     }
 }
 
 /* ---- the disturbance, and rest under it -------------------------------------------------------------------------- */
 
-/* Where the vehicle rests against the estimated disturbance: lift (3,), trim (4,), twist (3,) and effectiveness.
- * U / m R(eta) e_z = g e_z - a,    I^-1 tau = -alpha. */
-static void update_trim(quadsim_mpc *mpc)
+/* Where thrust along g e_z - a balances gravity and the estimated disturbance: puts g e_z - a into the trim's lift (3,)
+ * and returns U/m.  Its vertical part is at least a share of gravity. */
+static real find_lift(quadsim_mpc *mpc)
 {
     const quadsim_robust *r = mpc->controller->robust;
     const real x = mpc->estimate[0], y = mpc->estimate[1];
     const real length = square_root(x * x + y * y + r->gravity * r->gravity);
-    real axis[3], acceleration[3], drive[NU], up, thrust;
-    int i, j;
+    real axis[3], acceleration[3], up;
     axis[0] = -x / length;
     axis[1] = -y / length;
     axis[2] = r->gravity / length;
@@ -287,10 +299,20 @@ static void update_trim(quadsim_mpc *mpc)
     if (up < r->least_lift * r->gravity) {
         up = r->least_lift * r->gravity;
     }
-    thrust = square_root(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1] + up * up);
     mpc->trim.lift[0] = -acceleration[0];
     mpc->trim.lift[1] = -acceleration[1];
     mpc->trim.lift[2] = up;
+    return square_root(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1] + up * up);
+}
+
+/* Where the vehicle rests against the estimated disturbance: lift (3,), trim (4,), twist (3,) and effectiveness.
+ * U / m R(eta) e_z = g e_z - a,    I^-1 tau = -(U / m) twist. */
+static void update_trim(quadsim_mpc *mpc)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    const real thrust = find_lift(mpc);
+    real drive[NU];
+    int i, j;
     if (r->targets) {
         memset(mpc->trim.commands, 0, sizeof(mpc->trim.commands));
         mpc->trim.commands[0] = r->mass * thrust;
@@ -299,10 +321,11 @@ static void update_trim(quadsim_mpc *mpc)
     memcpy(mpc->effectiveness, r->effectiveness, sizeof(mpc->effectiveness));
     drive[0] = thrust;
     for (i = 0; i < 3; i++) {
-        mpc->trim.twist[i] = mpc->estimate[3 + i] / r->gravity;
-        drive[1 + i] = -thrust * mpc->trim.twist[i];
+        const real twist = mpc->estimate[3 + i] / r->gravity;
+        mpc->trim.twist[i] = twist;
+        drive[1 + i] = -thrust * twist;
         for (j = 0; j < NU; j++) {
-            mpc->effectiveness[(1 + i) * NU + j] += mpc->trim.twist[i] * r->effectiveness[j];
+            mpc->effectiveness[(1 + i) * NU + j] += twist * r->effectiveness[j];
         }
     }
     for (j = 0; j < NU; j++) {
@@ -310,79 +333,94 @@ static void update_trim(quadsim_mpc *mpc)
     }
 }
 
-/* What the air does at a state and the rotors' speeds there beyond what the hover matrices have of it: U/m, I^-1 tau.
- * They have it at hover speeds, of level velocities in their axes and of rates of Euler angles. */
+/* The components of a horizontal vector along axes that are turned about world z by an angle with this sine and
+ * cosine. */
+static void into_turned_axes(real x, real y, real sine, real cosine, real *along_x, real *along_y)
+{
+    *along_x = cosine * x + sine * y;
+    *along_y = cosine * y - sine * x;
+}
+
+/* beyond (4,) = what the air does to U/m and I^-1 tau at a state and the rotors' speeds there, less what the hover
+ * matrices have of it.  They have it of hover speeds, of horizontal velocities along their axes and of the rates of
+ * Euler angles; not of inflow, a product of two velocities. */
 static void air_beyond_hover(const quadsim_mpc *mpc, const real *state, real beyond[NU])
 {
     const quadsim_robust *r = mpc->controller->robust;
-    const real hovering = sum_of_inputs(mpc->controller->hover), speed = sum_of_inputs(mpc->turning);
-    real s[3], k[3], rates[3], along[3], known[3];
+    const real hovering = sum_of_inputs(mpc->controller->hover), speed = sum_of_inputs(mpc->rotors_ahead);
+    real s[3], k[3], rates[3], euler_rates[3], along[3], in_matrices[3];
     int i;
     sines_of(state, s, k);
     rates_of(state, s, k, rates);
     beyond[0] = r->loss * hovering * state[VZ] - air_effect(r, state, speed, s, k, rates, beyond + 1);
-    along[0] = r->heading ? k[2] * state[VX] + s[2] * state[VY] : state[VX];
-    along[1] = r->heading ? k[2] * state[VY] - s[2] * state[VX] : state[VY];
-    along[2] = R(0.0); /* of two velocities' product they know nothing */
-    for (i = 0; i < 3; i++) {
-        rates[i] = state[ROLL + 1 + 2 * i];
+    along[0] = state[VX];
+    along[1] = state[VY];
+    along[2] = R(0.0);
+    if (r->heading) {
+        into_turned_axes(state[VX], state[VY], s[2], k[2], &along[0], &along[1]);
     }
-    turn_by_air(r->across, r->inflow, r->damping, hovering, along, rates, known);
     for (i = 0; i < 3; i++) {
-        beyond[1 + i] -= known[i];
+        euler_rates[i] = state[ROLL + 1 + 2 * i];
+    }
+    turn_by_air(r->across, r->inflow, r->damping, hovering, along, euler_rates, in_matrices);
+    for (i = 0; i < 3; i++) {
+        beyond[1 + i] -= in_matrices[i];
     }
 }
 
-/* u_s: speeds at rest that also balance what is so now and the hover matrices omit: the torque caused by thrust as it
- * is, and what the air does at a state `ahead`, unless it is NULL. */
-static void update_resting(quadsim_mpc *mpc, const real *ahead)
+/* u_s: the trim's speeds, changed so that they also balance two effects of the present that the hover matrices omit:
+ * the torque that the disturbance causes at the present thrust, and what the air does at a state `ahead`, unless NULL.
+ */
+static void update_rest_command(quadsim_mpc *mpc, const real *ahead)
 {
     const quadsim_robust *r = mpc->controller->robust;
     const real *rest = mpc->trim.commands;
     real excess_thrust = R(0.0), beyond[NU];
     int j;
     if (r->targets) {
-        memcpy(mpc->resting, rest, sizeof(mpc->resting));
+        memcpy(mpc->rest_command, rest, sizeof(mpc->rest_command));
         return;
     }
     for (j = 0; j < NU; j++) {
-        excess_thrust += r->effectiveness[j] * (mpc->turning[j] * mpc->turning[j] - rest[j] * rest[j]);
+        excess_thrust += r->effectiveness[j] * (mpc->rotors_ahead[j] * mpc->rotors_ahead[j] - rest[j] * rest[j]);
     }
     for (j = 0; j < NU; j++) {
-        mpc->resting[j] = rest[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->trim.twist, 3);
+        mpc->rest_command[j] = rest[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->trim.twist, 3);
     }
     if (r->moment && ahead != NULL) {
         air_beyond_hover(mpc, ahead, beyond);
         for (j = 0; j < NU; j++) {
-            mpc->resting[j] -= dot(r->slope_inverse + j * NU, beyond, NU);
+            mpc->rest_command[j] -= dot(r->slope_inverse + j * NU, beyond, NU);
         }
     }
 }
 
-/* Update the disturbance from a measured state and the one that was expected. */
+/* Update the disturbance from the innovation, the difference of a measured state and the one that was expected.  Of
+ * velocities, the vertical difference is taken to be that along the thrust axis, over the cosine of the tilt; what that
+ * leaves of the horizontal differences is along world x and y. */
 static void observe_state(quadsim_mpc *mpc, const real *measured, const real *expected)
 {
     const quadsim_robust *r = mpc->controller->robust;
-    real axis[3], rates[3], expected_rates[3], surprise[6], upright;
+    real axis[3], rates[3], expected_rates[3], innovation[6], upright;
     int i;
     thrust_axis_at(measured, axis);
     body_rates(measured, rates);
     body_rates(expected, expected_rates);
     upright = axis[2] > r->upright ? axis[2] : r->upright;
-    surprise[2] = (measured[VZ] - expected[VZ]) / upright;
-    surprise[0] = (measured[VX] - expected[VX]) - surprise[2] * axis[0];
-    surprise[1] = (measured[VY] - expected[VY]) - surprise[2] * axis[1];
+    innovation[2] = (measured[VZ] - expected[VZ]) / upright;
+    innovation[0] = (measured[VX] - expected[VX]) - innovation[2] * axis[0];
+    innovation[1] = (measured[VY] - expected[VY]) - innovation[2] * axis[1];
     for (i = 0; i < 3; i++) {
-        surprise[3 + i] = rates[i] - expected_rates[i];
+        innovation[3 + i] = rates[i] - expected_rates[i];
     }
-    update_disturbance(r->gain, r->largest, surprise, mpc->estimate);
+    update_disturbance(r->gain, r->largest, innovation, mpc->estimate);
     update_trim(mpc);
 }
 
 /* ---- the robust controller --------------------------------------------------------------------------------------- */
 
-/* Rotor speeds after a time, of which the share that is still what it was is decay. */
-static void spin_rotors(real *rotors, const real *command, real decay)
+/* Rotor speeds after some time under a command: of their distance from it the share `decay` is left. */
+static void follow_command(real *rotors, const real *command, real decay)
 {
     int j;
     for (j = 0; j < NU; j++) {
@@ -390,92 +428,91 @@ static void spin_rotors(real *rotors, const real *command, real decay)
     }
 }
 
-/* The reference's row at the instant that its prediction is for, the delay after it; turns are those of row i. */
+/* Row i of the reference at the instant that its prediction is for, which is the delay later: interpolated, and held
+ * after the last row.  From the yaw of row i so many turns are taken off. */
 static void later_row(const quadsim_controller *c, const real *reference, int i, real turns, real row[4])
 {
-    const int last = i == c->problem->horizon - 1;
-    const real *now = reference + i * 4, *next = last ? now : now + 4;
-    const real heading = now[3] - TURN * turns;
-    const real ahead = last ? heading : next[3] - TURN * next_turns(reference, i + 1, turns);
+    const real share = c->robust->delayed_share;
+    const real *now = reference + i * 4, *next = now;
+    const real yaw = now[3] - TURN * turns;
+    real next_yaw = yaw;
     int j;
-    for (j = 0; j < 3; j++) {
-        row[j] = now[j] + c->robust->delayed_share * (next[j] - now[j]);
+    if (i < c->problem->horizon - 1) {
+        next = now + 4;
+        next_yaw = next[3] - TURN * next_turns(reference, i + 1, turns);
     }
-    row[3] = heading + c->robust->delayed_share * (ahead - heading);
+    for (j = 0; j < 3; j++) {
+        row[j] = now[j] + share * (next[j] - now[j]);
+    }
+    row[3] = yaw + share * (next_yaw - yaw);
 }
 
-/* The reference's rates at the instant that the prediction of row i is for, likewise. */
+/* The reference's rates at that instant, likewise. */
 static void later_rates(const quadsim_controller *c, const real *reference, int i, real rates[4])
 {
     const int next = i == c->problem->horizon - 1 ? i : i + 1;
-    real ahead[4];
+    real next_rates[4];
     int j;
     reference_rates(c, reference, i, rates);
-    reference_rates(c, reference, next, ahead);
+    reference_rates(c, reference, next, next_rates);
     for (j = 0; j < 4; j++) {
-        rates[j] += c->robust->delayed_share * (ahead[j] - rates[j]);
+        rates[j] += c->robust->delayed_share * (next_rates[j] - rates[j]);
     }
 }
 
-/* The first two numbers, along world x and y, in axes turned by an angle. */
-static void turn_axes(real row[4], real sine, real cosine)
-{
-    const real x = row[0], y = row[1];
-    row[0] = cosine * x + sine * y;
-    row[1] = cosine * y - sine * x;
-}
-
-/* y_d of the reference [N][4] as the prediction is given it: later by the delay, and where the model is turned by the
- * heading, yaw without jumps, seen from axes turned by it. */
+/* y_d of the reference [N][4]: later by the delay, and where the model is turned by the heading, in axes turned by it,
+ * with yaw as distance from the present one, in steps of at most the largest turn.  Rows that are past when the command
+ * acts are passed over, and the last row is held. */
 static void put_desired(quadsim_mpc *mpc, const real *reference, real turns, real yaw, real sine, real cosine)
 {
     const quadsim_controller *c = mpc->controller;
-    const int end = c->problem->horizon - 1, under_way = c->robust->under_way;
-    real row[4], rates[4], last = yaw, turned = yaw;
+    const quadsim_robust *robust = c->robust;
+    const int last_row = c->problem->horizon - 1, under_way = robust->under_way;
+    real row[4], rates[4], yaw_before = yaw, limited_yaw = yaw;
     int i;
-    for (i = 0; i < under_way && i <= end; i++) { /* rows that are past when the command acts */
+    for (i = 0; i < under_way && i <= last_row; i++) {
         turns = next_turns(reference, i, turns);
     }
-    for (i = 0; i <= end; i++) {
-        const int at = i + under_way < end ? i + under_way : end;
+    for (i = 0; i <= last_row; i++) {
+        const int at = i + under_way < last_row ? i + under_way : last_row;
         real *desired = mpc->desired + i * c->problem->regulated;
-        if (i + under_way <= end) {
+        if (i + under_way <= last_row) {
             turns = next_turns(reference, at, turns);
         }
         later_row(c, reference, at, turns, row);
-        if (c->robust->heading) {
-            const real step = row[3] - last;
-            last = row[3];
-            turned += clipped(step, -c->robust->largest_turn, c->robust->largest_turn);
-            turn_axes(row, sine, cosine);
-            row[3] = turned - yaw;
+        if (robust->heading) {
+            const real step = row[3] - yaw_before;
+            yaw_before = row[3];
+            limited_yaw += clipped(step, -robust->largest_turn, robust->largest_turn);
+            into_turned_axes(row[0], row[1], sine, cosine, &row[0], &row[1]);
+            row[3] = limited_yaw - yaw;
         }
-        put_places(c->problem, row, desired);
+        put_desired_pose(c->problem, row, desired);
         if (c->follows_rates) {
             later_rates(c, reference, at, rates);
-            if (c->robust->heading) {
-                turn_axes(rates, sine, cosine);
+            if (robust->heading) {
+                into_turned_axes(rates[0], rates[1], sine, cosine, &rates[0], &rates[1]);
             }
-            add_rates(c->problem, rates, desired);
+            add_desired_rates(c->problem, rates, desired);
         }
     }
 }
 
-/* The last states of a state, which are rotor speeds where these lag. */
+/* Put rotor speeds into the last entries of a state, where these lag. */
 static void put_speeds(const quadsim_problem *p, const real *speeds, real *state)
 {
     int j;
-    for (j = 0; j < p->speeds; j++) {
+    for (j = 0; j < p->rotor_states; j++) {
         state[12 + j] = speeds[j];
     }
 }
 
-/* Where the model rests: x_s at the present place, u_s as it is. */
+/* x_s: at the present position, with the lean that balances the disturbance, and with the rotor speeds u_s. */
 static void put_rest(quadsim_mpc *mpc, real sine, real cosine)
 {
     rest_at(mpc->state, mpc->rest);
     lean_of(mpc->trim.lift, sine, cosine, &mpc->rest[ROLL], &mpc->rest[PITCH]);
-    put_speeds(mpc->controller->problem, mpc->resting, mpc->rest);
+    put_speeds(mpc->controller->problem, mpc->rest_command, mpc->rest);
 }
 
 /* The query from a state at the instant from which the command acts. */
@@ -488,30 +525,59 @@ static void put_query(quadsim_mpc *mpc, const real *ahead, const real *reference
     if (c->robust->heading) {
         mpc->yaw = ahead[YAW];
         sin_cos(ahead[YAW], &sine, &cosine);
-        state[X] = cosine * ahead[X] + sine * ahead[Y];
-        state[Y] = cosine * ahead[Y] - sine * ahead[X];
-        state[VX] = cosine * ahead[VX] + sine * ahead[VY];
-        state[VY] = cosine * ahead[VY] - sine * ahead[VX];
+        into_turned_axes(ahead[X], ahead[Y], sine, cosine, &state[X], &state[Y]);
+        into_turned_axes(ahead[VX], ahead[VY], sine, cosine, &state[VX], &state[VY]);
         state[YAW] = R(0.0);
     }
-    put_speeds(c->problem, mpc->turning, state);
+    put_speeds(c->problem, mpc->rotors_ahead, state);
     put_rest(mpc, sine, cosine);
     put_desired(mpc, reference, turns, ahead[YAW], sine, cosine);
 }
 
-/* The i-th of the commands that act one after the other until this period's does: in force, under way. */
+/* The i-th of the commands that act one after the other until this period's does: 0 is in force, the last was sent a
+ * period ago. */
 static const real *sent_command(const quadsim_mpc *mpc, int i, const real *acting)
 {
     return i < mpc->controller->robust->under_way ? mpc->sent + i * NU : acting;
 }
 
-/* Take note of the last command sent. */
+/* Move the commands under way on by a period, with the last one sent as the newest. */
 static void note_sent(quadsim_mpc *mpc, const real *acting)
 {
     const int n = mpc->controller->robust->under_way;
     int i;
     for (i = 0; i < n; i++) {
         memcpy(mpc->sent + i * NU, sent_command(mpc, i + 1, acting), NU * sizeof(real));
+    }
+}
+
+/* Let the observer compare a state with the one that was expected: that predicted for t_k from the last period's
+ * `ahead`, with rotor speeds `before` there and the command in force. */
+static void compare_with_expected(quadsim_mpc *mpc, const real *state, const real *before, const real *in_force)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    real expected[12];
+    memcpy(expected, mpc->ahead, sizeof(expected));
+    predict_vehicle(mpc, r->rest_of_period, r->decay_before, r->answer_before, before, in_force, expected);
+    if (is_finite(expected, 12)) {
+        observe_state(mpc, state, expected);
+    }
+}
+
+/* Predict through the commands under way, a period each, to the instant from which this period's command acts: the
+ * rotors' speeds, and, where it is known, the state `ahead`. */
+static void pass_commands_under_way(quadsim_mpc *mpc, int is_known, const real *acting, real ahead[12])
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    int i;
+    memcpy(ahead, mpc->ahead, sizeof(mpc->ahead));
+    memcpy(mpc->rotors_ahead, mpc->rotors, sizeof(mpc->rotors_ahead));
+    for (i = 1; i <= r->under_way; i++) {
+        const real *next = sent_command(mpc, i, acting);
+        if (is_known) {
+            predict_vehicle(mpc, r->period, r->decay_period, r->answer_period, mpc->rotors_ahead, next, ahead);
+        }
+        follow_command(mpc->rotors_ahead, next, r->left_after_period);
     }
 }
 
@@ -522,52 +588,40 @@ static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real a
 {
     const quadsim_robust *r = mpc->controller->robust;
     const real *acting = mpc->acting, *in_force = sent_command(mpc, 0, acting);
-    real before[NU], expected[12];
-    int i;
+    real before[NU];
     memcpy(before, mpc->rotors, sizeof(before));
-    spin_rotors(mpc->rotors, in_force, r->spun_before);
-    if (state != NULL && r->observes && mpc->known && learns) {
-        memcpy(expected, mpc->ahead, sizeof(expected));
-        predict_vehicle(mpc, r->rest_of_period, r->decay_before, r->answer_before, before, in_force, expected);
-        if (is_finite(expected, 12)) {
-            observe_state(mpc, state, expected);
-        }
+    follow_command(mpc->rotors, in_force, r->left_after_rest);
+    if (state != NULL && r->observes && mpc->ahead_known && learns) {
+        compare_with_expected(mpc, state, before, in_force);
     }
     if (state != NULL) {
         memcpy(mpc->ahead, state, sizeof(mpc->ahead));
         predict_vehicle(mpc, r->delay, r->decay_delay, r->answer_delay, mpc->rotors, in_force, mpc->ahead);
     }
-    spin_rotors(mpc->rotors, in_force, r->spun_delay);
-    memcpy(ahead, mpc->ahead, sizeof(mpc->ahead));
-    memcpy(mpc->turning, mpc->rotors, sizeof(mpc->turning));
-    for (i = 1; i <= r->under_way; i++) {
-        const real *next = sent_command(mpc, i, acting);
-        if (state != NULL) {
-            predict_vehicle(mpc, r->period, r->decay_period, r->answer_period, mpc->turning, next, ahead);
-        }
-        spin_rotors(mpc->turning, next, r->spun_period);
-    }
+    follow_command(mpc->rotors, in_force, r->left_after_delay);
+    pass_commands_under_way(mpc, state != NULL, acting, ahead);
     note_sent(mpc, acting);
-    mpc->known = state != NULL && is_finite(ahead, 12);
-    update_resting(mpc, mpc->known ? ahead : NULL);
-    return mpc->known;
+    mpc->ahead_known = state != NULL && is_finite(ahead, 12);
+    update_rest_command(mpc, mpc->ahead_known ? ahead : NULL);
+    return mpc->ahead_known;
 }
 
 /* The query of the robust controller; returns whether there is one. */
 static int prepare_robust(quadsim_mpc *mpc, int flying, int learns, const real *state, const real *reference)
 {
     real ahead[12];
-    const int known = predict_ahead(mpc, state, learns, ahead);
-    mpc->known = known && flying;
-    if (known && state != NULL) {
-        put_query(mpc, ahead, reference, first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]));
+    const int is_known = predict_ahead(mpc, state, learns, ahead);
+    mpc->ahead_known = is_known && flying;
+    if (is_known && state != NULL) {
+        const real turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
+        put_query(mpc, ahead, reference, turns);
     }
-    return known;
+    return is_known;
 }
 
 /* ---- the controllers --------------------------------------------------------------------------------------------- */
 
-/* Whether numbers are within magnitudes [count] that are taken for a measurement, as none that is not finite is. */
+/* Whether the magnitudes of numbers are at most those of plausible measurements; not where one is not finite. */
 static int is_plausible(const real *numbers, const real *most, int count)
 {
     int i;
@@ -579,7 +633,7 @@ static int is_plausible(const real *numbers, const real *most, int count)
     return 1;
 }
 
-/* Whether a period's inputs can be answered. */
+/* Whether a period's inputs are such that there is a query: finite, and for the robust controller plausible. */
 static int is_usable(const quadsim_controller *c, const real *state, const real *reference, const real *acting)
 {
     const int N = c->problem->horizon;
@@ -605,22 +659,22 @@ static void prepare_paper(quadsim_mpc *mpc, const real *state, const real *refer
     real row[4], rates[4], turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
     int i;
     memcpy(mpc->state, state, 12 * sizeof(real));
-    memcpy(mpc->resting, c->hover, sizeof(mpc->resting));
+    memcpy(mpc->rest_command, c->hover, sizeof(mpc->rest_command));
     rest_at(state, mpc->rest); /* hover is an equilibrium anywhere and at any yaw: here there is least to round */
     for (i = 0; i < c->problem->horizon; i++) {
         real *desired = mpc->desired + i * c->problem->regulated;
         turns = next_turns(reference, i, turns);
         memcpy(row, reference + i * 4, sizeof(row));
         row[3] -= TURN * turns;
-        put_places(c->problem, row, desired);
+        put_desired_pose(c->problem, row, desired);
         if (c->follows_rates) {
             reference_rates(c, reference, i, rates);
-            add_rates(c->problem, rates, desired);
+            add_desired_rates(c->problem, rates, desired);
         }
     }
 }
 
-/* Numbers of the commands that are remembered. */
+/* How many numbers the commands under way are. */
 static int sent_reals(const quadsim_controller *controller)
 {
     return controller->robust == NULL ? 0 : controller->robust->under_way * NU;
@@ -638,10 +692,10 @@ void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, r
     memset(mpc, 0, sizeof(*mpc));
     mpc->controller = controller;
     mpc->desired = memory;
-    mpc->kept = memory + p->horizon * p->regulated;
-    mpc->sent = mpc->kept + p->horizon * NU;
+    mpc->guard_plan = memory + p->horizon * p->regulated;
+    mpc->sent = mpc->guard_plan + p->horizon * NU;
     quadsim_work_start(&mpc->work, p, mpc->sent + sent_reals(controller));
-    quadsim_guard_start(&mpc->guard, controller->fallback, p->horizon, mpc->kept);
+    quadsim_guard_start(&mpc->guard, controller->fallback, p->horizon, mpc->guard_plan);
     quadsim_mpc_reset(mpc, controller->hover);
 }
 
@@ -656,19 +710,20 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     }
     memcpy(mpc->before, usable, sizeof(mpc->before));
     memcpy(mpc->rotors, usable, sizeof(mpc->rotors));
-    memcpy(mpc->turning, usable, sizeof(mpc->turning));
+    memcpy(mpc->rotors_ahead, usable, sizeof(mpc->rotors_ahead));
     for (i = 0; i < sent_reals(mpc->controller); i++) {
         mpc->sent[i] = usable[i % NU];
     }
     memset(mpc->estimate, 0, sizeof(mpc->estimate));
     quadsim_work_reset(&mpc->work);
-    mpc->known = mpc->headed = 0;
-    memcpy(mpc->resting, mpc->controller->hover, sizeof(mpc->resting));
+    mpc->ahead_known = 0;
+    mpc->headed = 0;
+    memcpy(mpc->rest_command, mpc->controller->hover, sizeof(mpc->rest_command));
     memcpy(mpc->trim.commands, mpc->controller->hover, sizeof(mpc->trim.commands));
     mpc->trim.lift[2] = R(1.0);
     if (mpc->controller->robust != NULL) {
         update_trim(mpc);
-        update_resting(mpc, NULL);
+        update_rest_command(mpc, NULL);
     }
 }
 
@@ -686,7 +741,7 @@ void quadsim_mpc_stand(quadsim_mpc *mpc, const quadsim_real acting[4])
         (void)predict_ahead(mpc, NULL, 0, ahead);
         memset(mpc->estimate, 0, sizeof(mpc->estimate));
         update_trim(mpc);
-        update_resting(mpc, NULL);
+        update_rest_command(mpc, NULL);
     }
     memcpy(mpc->before, mpc->acting, sizeof(mpc->before));
 }
@@ -699,7 +754,7 @@ void quadsim_mpc_learn(quadsim_mpc *mpc, const quadsim_real estimate[6])
     }
     put_disturbance(r->largest, estimate, mpc->estimate);
     update_trim(mpc);
-    update_resting(mpc, NULL);
+    update_rest_command(mpc, NULL);
 }
 
 enum quadsim_status quadsim_mpc_prepare(quadsim_mpc *mpc, int flying, int learns, const quadsim_real state[12],
@@ -719,7 +774,7 @@ enum quadsim_status quadsim_mpc_prepare(quadsim_mpc *mpc, int flying, int learns
 
 enum quadsim_status quadsim_mpc_optimise(quadsim_mpc *mpc)
 {
-    return (enum quadsim_status)quadsim_optimise(&mpc->work, mpc->state, mpc->desired, mpc->rest, mpc->resting,
+    return (enum quadsim_status)quadsim_optimise(&mpc->work, mpc->state, mpc->desired, mpc->rest, mpc->rest_command,
                                                  mpc->acting);
 }
 
@@ -743,7 +798,7 @@ enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase,
         status = quadsim_guard_check(guard, status, plan);
     }
     if (quadsim_guard_foresees(guard, phase, status)) { /* the paper's model is not turned */
-        quadsim_guard_foresee(guard, c->robust != NULL, &mpc->trim, mpc->resting);
+        quadsim_guard_foresee(guard, c->robust != NULL, &mpc->trim, mpc->rest_command);
     }
     status = quadsim_guard_end(guard, phase, &mpc->trim, status, plan, command);
     memcpy(mpc->before, command, sizeof(mpc->before));

@@ -28,46 +28,59 @@ enum { QUADSIM_SUBSTEPS = 2 };
 enum { QUADSIM_ANSWER = 4 * 6 };  /* numbers of an inner loop's answer in such a step */
 enum { QUADSIM_LAW_STATES = 16 }; /* of a problem: 12, and 4 that stand for rotor speeds where these lag */
 
-/* The robust controller's numbers besides those of its problem.  Matrices are row by row. */
+/* The robust controller's numbers besides those of its problem.  Matrices are row by row.
+ *
+ * A delay is under_way whole periods and the rest `delay`, which is less than a period or equal to one: in each period,
+ * one more command takes over `delay` after its start, and is in force for rest_of_period until the next start.  Of
+ * each of these spans, and of a whole period, there are:
+ * left_after_...   the share that is left after it of the rotors' distance from their command;
+ * decay_... [SUBSTEPS][4]      the same at the instants of Runge-Kutta's stages;
+ * answer_... [SUBSTEPS][4][6]  of an inner loop at these instants, about body x, y, z: the share that is left of the
+ *                              body rates at the start [3], and what the turn since then takes from their targets [3]
+ */
 typedef struct quadsim_robust {
-    int observes;                     /* whether disturbances are estimated */
-    int heading;                      /* whether the model is turned by the yaw */
-    int targets;                      /* whether commands are an inner loop's targets: T, p, q, r */
-    int under_way;                    /* whole periods that a command takes to act, before delay */
-    quadsim_real gravity;             /* [m/s^2] */
-    quadsim_real least_lift, upright; /* least shares of weight, and of thrust along z */
-    quadsim_real period, delay, delayed_share, rest_of_period; /* [s], [s], share of the period, [s] */
-    quadsim_real spun_period, spun_delay, spun_before; /* shares of rotor speeds left after these and rest_of_period */
-    quadsim_real largest_turn;                         /* of the reference's yaw in a period [rad] */
-    quadsim_real effectiveness[16];                    /* from squared speeds to U/m and I^-1 tau */
-    quadsim_real allocation[16];                       /* its inverse */
-    quadsim_real gyration[3];
-    int moment;                                          /* whether the one-step prediction has what the air does: */
-    quadsim_real across[6], inflow[6], damping[9], loss; /* I^-1 torque: [3][2] of velocity along body x and y, per sum
-                                                          * of the rotors' speeds and per velocity along z, [3][3] of
-                                                          * rates; U/m lost per sum of speeds and velocity along z */
-    quadsim_real slope_inverse[16];                  /* from changes of U/m and I^-1 tau to those of speeds at hover */
-    quadsim_real gain[6], largest[6];                /* of the observer; of its estimate */
-    quadsim_real decay_before[QUADSIM_SUBSTEPS * 4]; /* shares left at instants of rest_of_period */
-    quadsim_real decay_delay[QUADSIM_SUBSTEPS * 4];  /* of delay */
-    quadsim_real decay_period[QUADSIM_SUBSTEPS * 4]; /* and of a period */
-    quadsim_real mass;                               /* of targets: [kg] */
-    quadsim_real
-        answer_before[QUADSIM_SUBSTEPS * QUADSIM_ANSWER];         /* what is left of body rates [3] and what the turn */
-    quadsim_real answer_delay[QUADSIM_SUBSTEPS * QUADSIM_ANSWER]; /* takes of their targets [3], at those instants */
+    int observes;                /* whether disturbances are estimated */
+    int heading;                 /* whether the model is turned by the yaw */
+    int targets;                 /* whether commands are an inner loop's targets: T, p, q, r */
+    int under_way;               /* whole periods that a command takes to act, before delay */
+    quadsim_real gravity;        /* [m/s^2] */
+    quadsim_real least_lift;     /* least share of the weight that thrust is taken to balance */
+    quadsim_real upright;        /* least cosine of the tilt that the observer divides by */
+    quadsim_real period, delay;  /* [s] */
+    quadsim_real delayed_share;  /* delay as a share of the period */
+    quadsim_real rest_of_period; /* [s] */
+    quadsim_real left_after_period, left_after_delay, left_after_rest;
+    quadsim_real largest_turn;      /* of the reference's yaw in a period [rad] */
+    quadsim_real effectiveness[16]; /* from squared speeds to U/m and I^-1 tau */
+    quadsim_real allocation[16];    /* its inverse */
+    quadsim_real gyration[3];       /* (I_y - I_z) / I_x and so on */
+    int moment;                     /* whether the one-step prediction has what the air does, by the next four: */
+    quadsim_real across[6];         /* I^-1 torque [3][2] per sum of the rotors' speeds and velocity along body x, y */
+    quadsim_real inflow[6];         /* I^-1 torque [3][2] per velocity along body z and velocity along body x, y */
+    quadsim_real damping[9];        /* I^-1 torque [3][3] per body rate */
+    quadsim_real loss;              /* U/m lost per sum of the rotors' speeds and velocity along body z */
+    quadsim_real slope_inverse[16]; /* from changes of U/m and I^-1 tau to those of speeds at hover */
+    quadsim_real gain[6];           /* of the observer */
+    quadsim_real largest[6];        /* magnitudes of its estimate */
+    quadsim_real decay_before[QUADSIM_SUBSTEPS * 4]; /* of rest_of_period */
+    quadsim_real decay_delay[QUADSIM_SUBSTEPS * 4];
+    quadsim_real decay_period[QUADSIM_SUBSTEPS * 4];
+    quadsim_real mass;                                             /* where commands are targets [kg] */
+    quadsim_real answer_before[QUADSIM_SUBSTEPS * QUADSIM_ANSWER]; /* of rest_of_period */
+    quadsim_real answer_delay[QUADSIM_SUBSTEPS * QUADSIM_ANSWER];
     quadsim_real answer_period[QUADSIM_SUBSTEPS * QUADSIM_ANSWER];
-    quadsim_real plausible_state[12], plausible_reference[4]; /* most that is taken for a measurement */
+    quadsim_real plausible_state[12], plausible_reference[4]; /* largest magnitudes of a measurement and a reference */
 } quadsim_robust;
 
-/* A controller's numbers. */
+/* A controller's numbers.  Where another solver optimises, the problem has no axes, and only quadsim_mpc_prepare may be
+ * called; where quadsim guards, the fallback is NULL, and quadsim_mpc_step may not be called. */
 typedef struct quadsim_controller {
-    const quadsim_problem
-        *problem;                 /* without axes where another solver optimises: quadsim_mpc_prepare is for it alone */
+    const quadsim_problem *problem;
     const quadsim_robust *robust; /* NULL: the paper's controllers */
-    const quadsim_fallback *fallback; /* NULL where quadsim guards: quadsim_mpc_step is not for it */
-    quadsim_real hover[4];            /* [rad/s] */
-    int follows_rates;                /* whether a desired output is a velocity or the yaw rate of the reference */
-    quadsim_real period;              /* [s] */
+    const quadsim_fallback *fallback;
+    quadsim_real hover[4]; /* [rad/s] */
+    int follows_rates;     /* whether a desired output is a velocity or the yaw rate of the reference */
+    quadsim_real period;   /* [s] */
 } quadsim_controller;
 
 /* A controller.  Read guard.level, work.changes and work.plan, the last optimum [N][4] in rad/s, and the query; the
@@ -75,24 +88,24 @@ typedef struct quadsim_controller {
 typedef struct quadsim_mpc {
     const quadsim_controller *controller;
     quadsim_work work;
-    quadsim_real *desired; /* the query: y_d [N][n_r] */
-    quadsim_real *kept;    /* [N][4] of the guard */
-    quadsim_real *sent;    /* robust: [under_way][4] the commands before the last, oldest first [rad/s] */
-    quadsim_real state[QUADSIM_LAW_STATES]; /* the query: x(k), seen from axes that may be turned by the yaw */
-    quadsim_real rest[QUADSIM_LAW_STATES];  /* where the model rests, x_s */
-    quadsim_real resting[4];                /* and at which speeds, u_s [rad/s] */
-    quadsim_real acting[4];                 /* and the command in force, u(k-1) [rad/s] */
-    quadsim_real yaw;                       /* by which its axes are turned about world z [rad] */
-    quadsim_real before[4];                 /* the last command [rad/s] */
+    quadsim_real *desired;    /* the query: y_d [N][n_r] */
+    quadsim_real *guard_plan; /* [N][4] memory of the guard */
+    quadsim_real *sent;       /* robust: [under_way][4] the commands before the last, oldest first [rad/s] */
+    quadsim_real state[QUADSIM_LAW_STATES]; /* the query: x(k), in axes that may be turned by the yaw */
+    quadsim_real rest[QUADSIM_LAW_STATES];  /* the query: x_s, where the model rests */
+    quadsim_real rest_command[4];           /* the query: u_s, the speeds or targets there [rad/s], [N] */
+    quadsim_real acting[4];                 /* the query: u(k-1), the last command sent [rad/s] */
+    quadsim_real yaw;                       /* by which the query's axes are turned about world z [rad] */
+    quadsim_real before[4];                 /* the command of the last period, should acting not be finite [rad/s] */
     int headed;                             /* whether a heading has been followed */
     quadsim_real heading;           /* the reference's one period from now, on the turn that is followed [rad] */
-    int known;                      /* robust: whether the state ahead is known */
+    int ahead_known;                /* robust: whether `ahead` is known */
     quadsim_real rotors[4];         /* robust: speeds when the next command takes over in this period [rad/s] */
-    quadsim_real ahead[12];         /* the state there */
-    quadsim_real turning[4];        /* speeds at the instant from which the command acts [rad/s] */
+    quadsim_real ahead[12];         /* robust: the state at that instant */
+    quadsim_real rotors_ahead[4];   /* robust: speeds at the instant from which this period's command acts [rad/s] */
     quadsim_real estimate[6];       /* disturbance: world x, y, along thrust [m/s^2], body [rad/s^2] */
-    quadsim_trim trim;              /* at rest against it; the paper's: level hover */
-    quadsim_real effectiveness[16]; /* from squared speeds to U/m and I^-1 tau, so twisted */
+    quadsim_trim trim;              /* equilibrium under it; the paper's controllers: level hover */
+    quadsim_real effectiveness[16]; /* from squared speeds to U/m and I^-1 tau under it, in which thrust twists */
     quadsim_guard guard;
 } quadsim_mpc;
 

@@ -28,18 +28,18 @@ static long larger_of(long a, long b)
     return a > b ? a : b;
 }
 
-/* Reals that the responses' memory has room for: the responses of all rows, the costs that a recursion keeps, or the
- * numbers of an interior point method. */
+/* Reals of the memory of responses, which is reused: the responses of all rows, the costs that a recursion keeps, or
+ * the numbers of an interior point method. */
 static long responses_size(const quadsim_nmpc_problem *p)
 {
     const long N = p->horizon, n = states_of(p), kept = (N - 1) * n * (n + 1);
-    return larger_of(p->room * entries_size(p), larger_of(kept, quadsim_nmpc_interior_size(p)));
+    return larger_of(p->capacity * entries_size(p), larger_of(kept, quadsim_nmpc_interior_size(p)));
 }
 
 /* Set a work's arrays of reals. */
 static void take_arrays(const quadsim_nmpc_problem *p, quadsim_nmpc_work *work, memory *from)
 {
-    const long N = p->horizon, n = states_of(p), room = p->room, w = entries_of(p), width = columns_of((int)n);
+    const long N = p->horizon, n = states_of(p), capacity = p->capacity, w = entries_of(p), width = columns_of((int)n);
     const int iterates = p->iterations > 1 || p->targets;
     take_reals(from, &work->x, (N + 1) * n);
     take_reals(from, &work->u, N * NU);
@@ -62,10 +62,10 @@ static void take_arrays(const quadsim_nmpc_problem *p, quadsim_nmpc_work *work, 
     take_reals(from, &work->value, (N + 1) * w);
     take_reals(from, &work->own, (N + 1) * w);
     take_reals(from, &work->response, responses_size(p));
-    take_reals(from, &work->factor, room * (room + 1) / 2);
-    take_reals(from, &work->multiplier, room);
-    take_reals(from, &work->r, room);
-    take_reals(from, &work->d, room);
+    take_reals(from, &work->factor, capacity * (capacity + 1) / 2);
+    take_reals(from, &work->multiplier, capacity);
+    take_reals(from, &work->r, capacity);
+    take_reals(from, &work->d, capacity);
     take_reals(from, &work->price, N * p->slacks);
     take_reals(from, &work->rate, N * p->slacks);
     take_reals(from, &work->origin, N * p->slacks);
@@ -84,7 +84,7 @@ long quadsim_nmpc_reals(const quadsim_nmpc_problem *problem)
 
 long quadsim_nmpc_ints(const quadsim_nmpc_problem *problem)
 {
-    return ROW_INTS * problem->room + (problem->slacks + NU) * problem->horizon;
+    return ROW_INTS * problem->capacity + (problem->slacks + NU) * problem->horizon;
 }
 
 void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *problem, quadsim_real *reals, int *ints)
@@ -98,7 +98,7 @@ void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *pro
         work->face[3 * i] = work->face[3 * i + 1] = work->face[3 * i + 2] = work->beyond[i] = R(0.0);
     }
     work->row = (quadsim_nmpc_row *)ints;
-    work->free = ints + ROW_INTS * problem->room;
+    work->free = ints + ROW_INTS * problem->capacity;
     work->held = work->free + problem->slacks * problem->horizon;
     quadsim_nmpc_reset(work);
 }

@@ -55,7 +55,7 @@ typedef struct quadsim_nmpc_problem {
     int bound_nodes;          /* nodes whose bounds are stated; those of the last hold in all that follow */
     int faces;                /* at most so many half-spaces of positions, per node */
     int slacks;               /* of a node: of tilt, body rates and half-spaces, then those of rows */
-    int room;                 /* active rows that there is room for */
+    int capacity;             /* most active rows at a time */
     int changes;              /* of the active set in a search, after which it is given up */
     int iterations,
         corrections;        /* most SQP steps of a call; further ones, if the plan misses the dynamics by too much */
@@ -93,12 +93,12 @@ typedef struct quadsim_nmpc_world {
 } quadsim_nmpc_world;
 
 enum quadsim_nmpc_status {
-    QUADSIM_NMPC_FREE = 0,        /* the optimum without bounds satisfies them all */
-    QUADSIM_NMPC_BOUNDED = 1,     /* the optimum */
-    QUADSIM_NMPC_UNCONVERGED = 2, /* an optimum whose plan misses the dynamics by more than it should */
-    QUADSIM_NMPC_INFEASIBLE = 3,  /* no plan satisfies all hard bounds */
-    QUADSIM_NMPC_GIVEN_UP = 4,    /* too many changes of the active set, or too much rounding in it */
-    QUADSIM_NMPC_NO_ROOM = 5,     /* too many active rows */
+    QUADSIM_NMPC_FREE = 0,          /* the optimum without bounds satisfies them all */
+    QUADSIM_NMPC_BOUNDED = 1,       /* the optimum */
+    QUADSIM_NMPC_UNCONVERGED = 2,   /* an optimum whose plan misses the dynamics by more than it should */
+    QUADSIM_NMPC_INFEASIBLE = 3,    /* no plan satisfies all hard bounds */
+    QUADSIM_NMPC_GIVEN_UP = 4,      /* too many changes of the active set, or too much rounding in it */
+    QUADSIM_NMPC_OVER_CAPACITY = 5, /* too many active rows */
     QUADSIM_NMPC_NOT_FINITE = 6
 };
 
@@ -148,12 +148,12 @@ typedef struct quadsim_nmpc_work {
     quadsim_real *gain, *inverse, *feed, *more; /* [N][4][n], [N][16], [N][4], [N][4] */
     quadsim_real *s, *v;                        /* the optimum [N+1][n], [N][4]; quaternions in their frames */
     quadsim_real *value;                        /* [N+1][w] of entries at the present multipliers, those before first */
-    quadsim_real *own, *response;              /* [N+1][w]; [room][N+1][w], or what the recursion and the interior point
-                                                * method keep there */
-    quadsim_real *factor, *multiplier, *r, *d; /* L D L' of the active rows, row by row; [room] each */
+    quadsim_real *own, *response; /* [N+1][w]; [capacity][N+1][w], or what the recursion and the interior point
+                                   * method keep there */
+    quadsim_real *factor, *multiplier, *r, *d; /* L D L' of the active rows, row by row; [capacity] each */
     quadsim_real *price, *rate, *origin;      /* [N][slacks] sums of multipliers, and of their slopes; see the search */
     quadsim_real *x_before, *u_before, *last; /* the plan before a step, and [N][4] the step before; or candidates */
-    quadsim_nmpc_row *row;                    /* [room] active rows */
+    quadsim_nmpc_row *row;                    /* [capacity] active rows */
     int *free;                                /* [N][slacks] whether a slack may be positive */
     int *held;                                /* [N][4] inputs at bounds: 1 above, -1 below */
 } quadsim_nmpc_work;

@@ -173,9 +173,9 @@ static int first_slack_to_open(quadsim_nmpc_work *work, int slack, real multipli
     }
     for (j = 0; j < p->slacks * p->horizon; j++) {
         const real rate = work->rate[j];
-        const real room = quadsim_nmpc_linear_price(work, j) - work->price[j] - (j == slack ? multiplier : R(0.0));
-        if (rate > LEAST_CHANGE && !work->free[j] && room < *longest * rate) {
-            *longest = room > R(0.0) ? room / rate : R(0.0);
+        const real left = quadsim_nmpc_linear_price(work, j) - work->price[j] - (j == slack ? multiplier : R(0.0));
+        if (rate > LEAST_CHANGE && !work->free[j] && left < *longest * rate) {
+            *longest = left > R(0.0) ? left / rate : R(0.0);
             opens = j;
         }
     }
@@ -216,8 +216,8 @@ static enum quadsim_nmpc_status add_row(quadsim_nmpc_work *work, const quadsim_n
     const quadsim_nmpc_problem *p = work->p;
     const int slack = row->slack;
     real multiplier = R(0.0);
-    if (work->count == p->room) {
-        return QUADSIM_NMPC_NO_ROOM;
+    if (work->count == p->capacity) {
+        return QUADSIM_NMPC_OVER_CAPACITY;
     }
     quadsim_nmpc_response(work, row, work->own);
     for (;;) {

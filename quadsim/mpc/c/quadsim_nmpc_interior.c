@@ -281,7 +281,7 @@ static void keep_active(quadsim_nmpc_work *work, const inner *at)
     for (node = 0, i = 0; at->rows > 0 && node < p->horizon; node++) {
         for (k = 0; k < kinds; k++, i++) {
             const int j = 2 * size + i;
-            if (at->by[j] > at->t[j] && work->count < p->room) {
+            if (at->by[j] > at->t[j] && work->count < p->capacity) {
                 quadsim_nmpc_row row;
                 quadsim_nmpc_state_row(p, node, k, &row);
                 work->row[work->count++] = row;

@@ -98,7 +98,7 @@ static void rows_of_held(quadsim_nmpc_work *work)
     const int size = work->p->horizon * NU;
     int i;
     for (i = 0; i < size; i++) {
-        if (work->held[i] != 0 && work->count < work->p->room) {
+        if (work->held[i] != 0 && work->count < work->p->capacity) {
             work->row[work->count++] = row_of_input(i / NU, i % NU, work->held[i]);
         }
         work->held[i] = 0;

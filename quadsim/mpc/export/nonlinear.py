@@ -149,6 +149,6 @@ class CNonlinear(CFollower):
             pointers[name] = f"{prefix}{name}"
         terms = program.terms if program.struct.rows else ()
         blocks.append(text.structs("quadsim_nmpc_term", "terms", terms))
-        members = text.mirrored(program.struct, pointers, room=self.rows + 1, changes=CHANGES)
+        members = text.mirrored(program.struct, pointers, capacity=self.rows + 1, changes=CHANGES)
         blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
         return blocks

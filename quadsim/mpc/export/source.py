@@ -263,7 +263,7 @@ class CController(CSource):
 
 def problem_data(text: CText, tables: Tables, capacity: int) -> list[str]:
     """Return the optimisation's numbers, with its `quadsim_problem` last."""
-    blocks, entries = text.members(members(tables, room=capacity, changes=CHANGES))
+    blocks, entries = text.members(members(tables, capacity=capacity, changes=CHANGES))
     return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
 
 

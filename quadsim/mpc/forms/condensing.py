@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 import scipy.linalg
 from scipy.linalg import lapack
 
 from quadsim.controller import UNCONSTRAINED
-from quadsim.mpc.problem.constraints import Bounds
+from quadsim.mpc.problem.constraints import Bounds, RowFlags
 from quadsim.mpc.problem.ocp import CondensedQP, Equilibrium, Problem, Query, check_shape
 from quadsim.mpc.problem.paper import Prediction, cost, prediction, slew_matrix
 from quadsim.mpc.problem.qp import QP, QPRows, Solution
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
-
-RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 LARGEST_QP: Final = 2**20
 """Largest size of the QP's matrices [entries] for which trying the unconstrained optimum first saves time."""

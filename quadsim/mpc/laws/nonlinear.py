@@ -59,8 +59,10 @@ from quadsim.vehicle import Vehicle
 
 MOST_LATE: Final = constant("QUADSIM_MOST_LATE")
 """Most control periods of a delay."""
-LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
+TRANSLATION: Final = ("x", "vx", "y", "vy", "z", "vz")
+"""States of the linear models that the quaternion model has as well, so that bounds on them are rows of both."""
 VEHICLES_SPEEDS: Final = RotorBounds()
+"""The bounds on rotor speeds of a table that states none: the vehicle's."""
 Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
 AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
@@ -86,23 +88,26 @@ class Weights:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            array = np.asarray(value, float)
-            inside = np.isfinite(array) & (array >= 0.0) & ((array > 0.0) | (name == "move"))
+            weights = np.asarray(value, float)
             shapes: tuple[tuple[int, ...], ...] = ((), (3,))
             rule = "positive: one number, or three"
             if name in ("input", "move"):
                 shapes = ((),)
                 rule = "one positive number"
-            if array.shape not in shapes or not inside.all():
+            in_range = weights > 0.0
+            if name == "move":
+                in_range = weights >= 0.0
+            if weights.shape not in shapes or not (in_range & np.isfinite(weights)).all():
                 raise ParameterError("controller.weights", name, value, rule)
-            if array.ndim:
-                object.__setattr__(self, name, tuple(array.tolist()))
+            if weights.ndim:
+                object.__setattr__(self, name, tuple(weights.tolist()))
 
 
 _USUAL = Weights()
 
 
 def _three(weight: AxisWeights) -> Array:
+    """Return one number per axis (3,)."""
     return np.broadcast_to(np.asarray(weight, float), 3)
 
 
@@ -225,22 +230,30 @@ class Nonlinear(TargetTable):
         if self.offset_free is not None and self.disturbance is not None:
             raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
         require_one_scale(self.indi, self.disturbance)
+        self._check_state_bounds()
+        self._check_commands()
+
+    def _check_state_bounds(self) -> None:
+        """Check `output_bounds` and `climb_acceleration`."""
         for name, pair in self.output_bounds.items():
-            if name not in LINEAR:
-                rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
-                raise ValueError(rule)
+            if name not in TRANSLATION:
+                known = ", ".join(TRANSLATION)
+                raise ValueError(f"output_bounds must be of {known}; got {name!r}: tilt bounds the attitude")
             require_ordered(f"output_bounds.{name}", pair)
         require_climb(self.climb_acceleration)
         if self.climb_acceleration is not None and self.tilt is None:
             raise ValueError("tilt must be given with climb_acceleration, or the vehicle turns over to descend")
-        of_rotors = {
+
+    def _check_commands(self) -> None:
+        """Refuse fields that do not act with these commands and inputs."""
+        usual_values_of_rotors = {
             "inputs": "thrust",
             "rotor_lag": 0.0,
             "moment": False,
             "indi": None,
             "input_bounds": VEHICLES_SPEEDS,
         }
-        require_space(self, of_rotors)
+        require_space(self, usual_values_of_rotors)
         self._require_polytopes_without_speeds()
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
@@ -279,14 +292,14 @@ class Nonlinear(TargetTable):
         if self.commands == ROTORS:
             return bounds | self.input_bounds.audited(vehicle)
         for name, target in self.target_bounds.audited(vehicle).items():
-            bound = bounds.get(name, target)
-            if target[1] < bound[1]:  # the tighter of both
-                bound = target
-            bounds[name] = bound
+            _, largest = bounds.get(name, target)
+            _, largest_target = target
+            if name not in bounds or largest_target < largest:  # the tighter of both counts
+                bounds[name] = target
         return bounds
 
     def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
-        """Return the half-spaces of obstacles and regions; None without any."""
+        """Return the half-spaces that avoid obstacles and keep within regions, at the nodes; None without avoidance."""
         if self.avoidance is None:
             return None
         stride = self.stride(period)
@@ -307,7 +320,9 @@ class Nonlinear(TargetTable):
         return climbing_targets(self.target_bounds.actuators(vehicle), vehicle, self.level_climb(vehicle))
 
     def level_climb(self, vehicle: Vehicle) -> Pair | None:
-        """Return the bounds on the climb acceleration in level flight that hold them up to the bound on the tilt.
+        """Return bounds on the climb acceleration in level flight; None without `climb_acceleration`.
+
+        They are such that up to the bound on the tilt the vertical acceleration is within `climb_acceleration`.
 
         Raises:
             ParameterError: hover is not within them.
@@ -317,13 +332,16 @@ class Nonlinear(TargetTable):
         return within_tilt(vehicle, self.climb_acceleration, self.tilt)
 
     def outputs(self) -> tuple[Array, Array]:
-        """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
+        """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q.
+
+        Its vector part is half the angle between both attitudes, to first order: weights of angles count four times.
+        """
         weights = self.weights
         if self.attitude_error == "difference":
             rows = np.eye(13)
             attitude = np.full(4, weights.attitude)
         else:
-            rows = np.delete(np.eye(13), 3, axis=0)
+            rows = np.delete(np.eye(13), 3, axis=0)  # without the quaternion's scalar part
             attitude = 4.0 * _three(weights.attitude)
         parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
         return rows, np.concatenate(parts)
@@ -353,12 +371,17 @@ class Nonlinear(TargetTable):
         polytopes = rows_of(self.polytopes)
         if not self.output_bounds:
             return polytopes
-        lower, upper = np.array([*self.output_bounds.values()], float).T
-        if self.soft is None:
-            penalty = None
-        else:
-            penalty = self.soft.penalty(lower.size)
-        rows = selection([*self.output_bounds])
-        origins = tuple(origin_of_state(INDEX[name]) for name in self.output_bounds)
-        outputs = Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty, origins=origins)
+        names = list(self.output_bounds)
+        lower, upper = np.array(list(self.output_bounds.values()), float).T
+        penalty = None
+        if self.soft is not None:
+            penalty = self.soft.penalty(len(names))
+        outputs = Constraint(
+            name="outputs",
+            lower=lower,
+            upper=upper,
+            C=selection(names),
+            penalty=penalty,
+            origins=tuple(origin_of_state(INDEX[name]) for name in names),
+        )
         return outputs, *polytopes

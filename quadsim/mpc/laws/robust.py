@@ -23,7 +23,7 @@ from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.problem.constraints import Constraint, Origin, Soft, origin_of_state
+from quadsim.mpc.problem.constraints import Bounds, Constraint, Origin, Penalty, Soft, origin_of_state
 from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight, objective_of
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
@@ -59,7 +59,8 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 if TYPE_CHECKING:
     from quadsim.mpc.laws.parts.linear import LinearMPC
 
-TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend on the yaw of the axes
+TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})
+"""States whose values change as the axes are turned about world z."""
 
 
 @register(
@@ -134,33 +135,41 @@ class Robust(TargetTable, Bounded):
                 _require_unturned(polytope.name, polytope.of)
 
     def _check_commands(self) -> None:
-        """Refuse fields of the other space of commands.
+        """Require the fields that the commands need, and refuse those that only other commands have.
 
         Raises:
             ValueError: a field is missing, or is given and does not act.
         """
         require_targets(self)
-        of_rotors: dict[str, object] = {"input_weights": self.input_weights, "input_bounds": self.input_bounds}
         if self.commands == ROTORS:
-            missing = [name for name, value in of_rotors.items() if value is None]
-            if missing:
-                raise ValueError(f"{' and '.join(missing)} must be given where rotors are commanded")
-            if self.target_weights is not None:
-                raise ValueError('target_weights must be absent where commands = "rotors": these pass no autopilot')
-            return
+            self._check_rotor_commands()
+        else:
+            self._check_target_commands()
+            self._require_polytopes_without_speeds()
+
+    def _check_rotor_commands(self) -> None:
+        required = {"input_weights": self.input_weights, "input_bounds": self.input_bounds}
+        missing = [name for name, value in required.items() if value is None]
+        if missing:
+            raise ValueError(f"{' and '.join(missing)} must be given where rotors are commanded")
+        if self.target_weights is not None:
+            raise ValueError('target_weights must be absent where commands = "rotors": these pass no autopilot')
+
+    def _check_target_commands(self) -> None:
         if self.target_weights is None:
             raise ValueError(f'target_weights must be given where commands = "{self.commands}"')
-        of_rotors |= {
-            "rotor_lag": self.rotor_lag or None,
-            "tightening": self.tightening,
-            "move_weight": self.move_weight,
-            "moment": self.moment or None,
+        is_given = {
+            "input_weights": self.input_weights is not None,
+            "input_bounds": self.input_bounds is not None,
+            "rotor_lag": self.rotor_lag != 0.0,
+            "tightening": self.tightening is not None,
+            "move_weight": self.move_weight is not None,
+            "moment": self.moment,
         }
-        for name, value in of_rotors.items():
-            if value is not None:
-                reason = "the autopilot turns the rotors; inner_lag, target_weights and target_bounds describe it"
+        reason = "the autopilot turns the rotors; inner_lag, target_weights and target_bounds describe it"
+        for name, given in is_given.items():
+            if given:
                 raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
-        self._require_polytopes_without_speeds()
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
@@ -192,38 +201,66 @@ class Robust(TargetTable, Bounded):
         return linear_law(self, preparation, solver, space)
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
-        """Return the optimisation of the hover model, with rotor speeds as states if they lag.
+        """Return the optimal control problem on the hover model, with rotor speeds as states if they lag.
 
         Raises:
             InputError: no problem can be built from these numbers.
         """
-        if self.delay > self.horizon * period:
-            rule = f"at most the horizon of {self.horizon} periods, {self.horizon * period:g} s"
+        longest_delay = self.horizon * period
+        if self.delay > longest_delay:
+            rule = f"at most the horizon of {self.horizon} periods, {longest_delay:g} s"
             raise ParameterError("controller", "delay", self.delay, rule)
         model = self._model(vehicle, period)
+        objective = self._objective_on(model)
+        bounds = None
+        if self.commands == ROTORS:
+            bounds = self._tightened_bounds(vehicle, period, model.n)
+            constraints = self._widened_constraints(vehicle, model.n)
+        else:
+            constraints = (*self._target_constraints(vehicle), *self.constraints(vehicle))
+        return Problem(
+            model=model,
+            horizon=self.horizon,
+            objective=objective,
+            bounds=bounds,
+            constraints=constraints,
+        )
+
+    def _objective_on(self, model: LinearModel) -> Objective:
+        """Return the weights on the model's states, with those of command changes and of the last state."""
         objective = self.objective()
-        n = model.n
         moves = None
         if self.move_weight is not None:
             moves = self.move_weight * np.eye(N_ROTORS)
-        objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
+        objective = replace(objective, C_r=_widened(objective.C_r, model.n), Q_d=moves)
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
-        if self.commands != ROTORS:
-            constraints = (*self._target_constraints(vehicle), *self.constraints(vehicle))
-            return Problem(model=model, horizon=self.horizon, objective=objective, constraints=constraints)
-        penalty = None
-        if self.soft is not None:
-            penalty = self.soft.penalty(len(self.output_bounds))
+        return objective
+
+    def _tightened_bounds(self, vehicle: Vehicle, period: float, n: int) -> Bounds:
+        """Return the bounds on a model of n states, soft and tightened as the table says."""
         bounds = self.bounds()
-        C_c = _widened(bounds.C_c, n)
-        bounds = replace(bounds, C_c=C_c, penalty=penalty, margins=self.margins(vehicle, period))
-        parts = []
-        for part in self.constraints(vehicle):
-            if part.C is not None:
-                part = replace(part, C=_widened(part.C, n))
-            parts.append(part)
-        return Problem(model=model, horizon=self.horizon, objective=objective, bounds=bounds, constraints=tuple(parts))
+        return replace(
+            bounds,
+            C_c=_widened(bounds.C_c, n),
+            penalty=self._penalty(),
+            margins=self.margins(vehicle, period),
+        )
+
+    def _widened_constraints(self, vehicle: Vehicle, n: int) -> tuple[Constraint, ...]:
+        """Return the rows in addition to the bounds, on a model of n states."""
+        constraints = []
+        for constraint in self.constraints(vehicle):
+            if constraint.C is not None:
+                constraint = replace(constraint, C=_widened(constraint.C, n))
+            constraints.append(constraint)
+        return tuple(constraints)
+
+    def _penalty(self) -> Penalty | None:
+        """Return the penalty of the output bounds; None where they are hard."""
+        if self.soft is None:
+            return None
+        return self.soft.penalty(len(self.output_bounds))
 
     def _model(self, vehicle: Vehicle, period: float) -> LinearModel:
         """Return the prediction model: with rotor speeds as states if they lag, or above an autopilot."""
@@ -234,31 +271,39 @@ class Robust(TargetTable, Bounded):
         if self.moment:
             vehicle.require_moment("controller")
         lag = resolved_lag(self.rotor_lag, vehicle)
-        A, B = discretise(*continuous_model(vehicle, lag, moment=self.moment), period)
+        A_c, B_c = continuous_model(vehicle, lag, moment=self.moment)
+        A, B = discretise(A_c, B_c, period)
         return LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
 
     def _target_constraints(self, vehicle: Vehicle) -> tuple[Constraint, Constraint]:
         """Return the bounds on outputs and on an autopilot's targets as constraints."""
         C_c, lower, upper = self.output_limits()
         names = [name for name in STATE_NAMES if name in self.output_bounds]
-        penalty = None
-        if self.soft is not None:
-            penalty = self.soft.penalty(len(names))
-        origins = tuple(origin_of_state(INDEX[name]) for name in names)
-        outputs = Constraint(name="outputs", lower=lower, upper=upper, C=C_c, penalty=penalty, origins=origins)
+        outputs = Constraint(
+            name="outputs",
+            lower=lower,
+            upper=upper,
+            C=C_c,
+            penalty=self._penalty(),
+            origins=tuple(origin_of_state(INDEX[name]) for name in names),
+        )
         bounds = self.actuators(vehicle)
-        rates = tuple(Origin(f"target of body rate {axis}", "deg/s", math.degrees(1.0)) for axis in "xyz")
+        thrust = Origin("target of thrust", "N")
+        rates = [Origin(f"target of body rate {axis}", "deg/s", math.degrees(1.0)) for axis in "xyz"]
         targets = Constraint(
             name="targets",
             lower=bounds.u_min,
             upper=bounds.u_max,
             D=np.eye(N_ROTORS),
-            origins=(Origin("target of thrust", "N"), *rates),
+            origins=(thrust, *rates),
         )
         return outputs, targets
 
     def solver_name(self, problem: Problem, space: Space | None) -> str:
-        """See `quadsim.mpc.tables.bounded.Bounded.solver_name`: the core where it takes the problem."""
+        """See `quadsim.mpc.tables.bounded.Bounded.solver_name`: if none is stated, the core where it takes the problem.
+
+        It does not take half-spaces, which differ from step to step.
+        """
         from quadsim.mpc.solvers.core import core_problem
 
         if self.solver is not None or space is not None:
@@ -270,23 +315,23 @@ class Robust(TargetTable, Bounded):
         return CORE
 
     def margins(self, vehicle: Vehicle, period: float) -> Array | None:
-        """Return the tightening of the output bounds at each predicted state, (N, n_c); None without tightening.
+        """Return by how much the output bounds are tightened at each predicted state, (N, n_c); None if they are not.
 
         Raises:
-            ParameterError: the bounds are too narrow for it.
+            ParameterError: the bounds are too narrow for that.
         """
         if self.tightening is None:
             return None
-        return margins(bounds=self.bounds(), **self._tightened(vehicle, period))
+        return margins(bounds=self.bounds(), **self._tightening_inputs(vehicle, period))
 
     def position_margins(self, vehicle: Vehicle, period: float) -> Array | None:
         """See `quadsim.mpc.tables.bounded.Bounded.position_margins`."""
         if self.tightening is None:
             return None
-        return position_margins(**self._tightened(vehicle, period))
+        return position_margins(**self._tightening_inputs(vehicle, period))
 
-    def _tightened(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
-        """Return the inputs of the tightening."""
+    def _tightening_inputs(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
+        """Return the arguments that `margins` and `position_margins` of `quadsim.mpc.problem.tightening` share."""
         return {
             "vehicle": vehicle,
             "period": period,
@@ -310,5 +355,6 @@ def _require_unturned(name: str, states: Sequence[str]) -> None:
 
 
 def _widened(matrix: Array, n: int) -> Array:
-    """Extend rows over 12 states to n states."""
-    return np.hstack([matrix, np.zeros((len(matrix), n - matrix.shape[1]))])
+    """Extend rows on 12 states by zeros to rows on n states."""
+    zeros = np.zeros((len(matrix), n - matrix.shape[1]))
+    return np.hstack([matrix, zeros])

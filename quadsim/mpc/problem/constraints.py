@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le, doc
@@ -20,6 +20,7 @@ from quadsim.state import INDEX, N_STATES, STATE_NAMES, STATE_UNITS, Array, Indi
 
 _INPUTS: Final = "controller.input_bounds"
 Price = Annotated[float, Ge(0.0), Le(1e12)]
+RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 class Origin(NamedTuple):
@@ -34,10 +35,16 @@ class Origin(NamedTuple):
     soft: str = ""  # table of the file that makes it soft; empty if none does
 
     def place(self, *, upper: bool) -> tuple[str, int]:
-        """Return the list of numbers in the file with one side of its bounds, and the entry; no list if none has it."""
+        """Return which list of numbers of the file has its upper or lower bound, and at which index.
+
+        A pair is a list, too, of the lower and the upper bound.  The name is empty if no file states the bound.
+        """
         if not self.field or self.row is None:
             return self.field, int(upper)
-        return f"{self.field}.{('lower', 'upper')[upper]}", self.row
+        side = "lower"
+        if upper:
+            side = "upper"
+        return f"{self.field}.{side}", self.row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +74,8 @@ class Penalty:
     def __post_init__(self) -> None:
         for name in ("l1", "l2"):
             value = getattr(self, name)
-            if value.shape != self.l1.shape or value.ndim != 1 or not (np.isfinite(value) & (value >= 0.0)).all():
+            is_vector = value.shape == self.l1.shape and value.ndim == 1
+            if not is_vector or not _finite_and_not_negative(value):
                 raise ParameterError("controller", name, value, "one finite number >= 0 per constrained output")
             if self.largest and (value != value[:1]).any():
                 raise ParameterError("controller", name, value, "the same number for all rows that share a slack")
@@ -129,9 +137,11 @@ class Constraint:
         counts = [matrix.shape[-2] for matrix in matrices]
         if not matrices or counts != [m] * len(matrices):
             raise ParameterError("controller", self.name, counts, f"{m} rows")
-        if not all(np.isfinite(matrix).all() for matrix in matrices):
-            raise ParameterError("controller", self.name, matrices, "finite numbers")
-        if self.C is not None and self.C.ndim == 3 and (self.D is not None or self.E is not None):
+        for matrix in matrices:
+            if not np.isfinite(matrix).all():
+                raise ParameterError("controller", self.name, matrices, "finite numbers")
+        involves_inputs = self.D is not None or self.E is not None
+        if self.C is not None and self.C.ndim == 3 and involves_inputs:
             raise ParameterError("controller", self.name, self.C.shape, "rows of states alone where they differ")
         if self.penalty is not None and self.penalty.l1.size != m:
             raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({m},)")
@@ -145,6 +155,10 @@ class Constraint:
         if self.lower.shape[-1] == 1:
             return Origin(self.name)
         return Origin(f"{self.name}, row {row + 1},")
+
+
+def _finite_and_not_negative(values: Array) -> bool:
+    return bool((np.isfinite(values) & (values >= 0.0)).all())
 
 
 def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
@@ -162,7 +176,8 @@ def tightened(constraint: Constraint, margins: Array) -> Constraint:
         ParameterError: a margin is negative, not finite or of another shape, or leaves no gap between the bounds.
     """
     m = constraint.lower.shape[-1]
-    if np.ndim(margins) != 2 or margins.shape[1] != m or not (np.isfinite(margins) & (margins >= 0.0)).all():
+    has_rows = np.ndim(margins) == 2 and margins.shape[1] == m
+    if not has_rows or not _finite_and_not_negative(margins):
         raise ParameterError("controller", "margins", margins, f"finite numbers >= 0 of shape (N, {m})")
     lower = constraint.lower + margins
     upper = constraint.upper - margins
@@ -199,33 +214,36 @@ class Bounds:
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
-        """The same as constraints: outputs, slews, inputs."""
+        """These bounds as three constraints: on outputs, tightened by the margins, on slews and on inputs."""
         outputs = Constraint(
             name="outputs",
             lower=self.y_min,
             upper=self.y_max,
             C=self.C_c,
             penalty=self.penalty,
-            origins=tuple(map(self.output, range(len(self.C_c)))),
+            origins=tuple(self.output(i) for i in range(len(self.C_c))),
         )
         if self.margins is not None:
             outputs = tightened(outputs, self.margins)
         rotors = self.u_min.size
-        each = np.eye(rotors)
+        identity = np.eye(rotors)
         slews = _rotor_origins("slew", rotors)
         speeds = _rotor_origins("speed", rotors)
         return (
             outputs,
-            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=each, origins=slews),
-            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=each, origins=speeds),
+            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=identity, origins=slews),
+            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=identity, origins=speeds),
         )
 
     def output(self, i: int) -> Origin:
         """Return the origin of a constrained output: a state, as scenario files name it, or a row of C_c."""
-        (states,) = np.nonzero(self.C_c[i])
-        if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
-            return Origin(f"row {i} of C_c")
-        return origin_of_state(int(states[0]))
+        row = self.C_c[i]
+        states = np.flatnonzero(row)
+        if states.size == 1:
+            state = int(states[0])
+            if row[state] == 1.0 and state < N_STATES:
+                return origin_of_state(state)
+        return Origin(f"row {i} of C_c")
 
 
 def _rotor_origins(name: str, rotors: int) -> tuple[Origin, ...]:
@@ -264,10 +282,10 @@ class Rows:
     l1: Array  # (m,) linear penalty of a normalised row; infinite for hard rows
     l2: Array  # (m,) quadratic penalty of a normalised row
     slack: Indices  # (m,) index of a soft row's slack within its step; -1 for hard rows
-    # (m,) whether a row is on the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
-    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    input: Indices  # (m,) the input that a hard row bounds alone; -1 otherwise
-    step: Indices  # (m,) the input whose step a hard row bounds alone; -1 otherwise
+    # (m,) whether a row is of states alone: its entry i is then for x(k+i+1), otherwise for x(k+i) and u(k+i)
+    of_states: RowFlags
+    input: Indices  # (m,) which input a hard row bounds, if it bounds nothing else; -1 otherwise
+    step: Indices  # (m,) which input's step u(k+i) - u(k+i-1) a hard row bounds, if nothing else; -1 otherwise
     names: tuple[str, ...]  # (m,) names of their constraints
 
     @cached_property
@@ -276,13 +294,13 @@ class Rows:
         return self.scale[self.slacks]
 
     @cached_property
-    def on_states(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Return (m,) whether a row involves states."""
+    def on_states(self) -> RowFlags:
+        """Return (m,) whether a row involves states, alone or not."""
         return _involves_states(self.C).reshape(len(self.D))
 
     @cached_property
     def starts(self) -> bool:
-        """Return whether a row involves the state at the start of its step."""
+        """Return whether a row involves the state at the start of its step: with inputs, at x(k+i)."""
         return bool((self.on_states & ~self.of_states).any())
 
     @cached_property
@@ -292,7 +310,7 @@ class Rows:
 
     @cached_property
     def slacks(self) -> Indices:
-        """Return (m_s,) the first row of each slack; all soft rows if none share a slack."""
+        """Return (n_s,) the first row of each slack; these are all soft rows if none share a slack."""
         _, first = np.unique(self.slack[self.soft], return_index=True)
         return self.soft[first]
 
@@ -310,8 +328,9 @@ def row_scale(largest: Array) -> Array:
     1 keep their scale of 1.
     """
     _, exponent = np.frexp(largest * (1.0 - SCALE_ROUNDING))
-    exponent = np.minimum(np.maximum(exponent, -LARGEST_EXPONENT), LARGEST_EXPONENT)
-    return np.asarray(np.where(largest > 0.0, np.ldexp(1.0, -exponent), 1.0))
+    exponent = np.clip(exponent, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+    scale = np.ldexp(1.0, -exponent)
+    return np.asarray(np.where(largest > 0.0, scale, 1.0))
 
 
 def renumbered(slack: Indices) -> Indices:
@@ -320,56 +339,35 @@ def renumbered(slack: Indices) -> Indices:
     return np.asarray(numbers[1:] - 1)
 
 
+@dataclass(frozen=True)
+class _Stack:
+    """Rows of one or more constraints one below the other, in the constraints' units; members as in `Rows`."""
+
+    C: Array
+    D: Array
+    E: Array
+    lower: Array
+    upper: Array
+    l1: Array
+    l2: Array
+    slack: Indices
+    names: list[str]
+
+
 def stacked_rows(constraints: Sequence[Constraint], *, horizon: int, n: int, nu: int) -> Rows:
     """Return the normalised rows of constraints on a model of n states and nu inputs."""
-    steps: tuple[int, ...] = ()
-    if any(part.C is not None and part.C.ndim == 3 for part in constraints):
-        steps = (horizon,)
-    on_states = []
-    on_inputs = []
-    on_moves = []
-    lowers = []
-    uppers = []
-    linear = []
-    quadratic = []
-    slacks = []
-    names: list[str] = []
-    for part in constraints:
-        m = part.lower.shape[-1]
-        on_states.append(_broadcast(part.C, (*steps, m, n)))
-        on_inputs.append(_broadcast(part.D, (m, nu)))
-        on_moves.append(_broadcast(part.E, (m, nu)))
-        lowers.append(np.broadcast_to(part.lower, (horizon, m)))
-        uppers.append(np.broadcast_to(part.upper, (horizon, m)))
-        if part.penalty is None:
-            linear.append(np.full(m, math.inf))
-            quadratic.append(np.zeros(m))
-            slacks.append(np.full(m, -1))
-        else:
-            linear.append(part.penalty.l1)
-            quadratic.append(part.penalty.l2)
-            first = len(names)  # the constraint's first row: its number is that of the slack, or of the first slack
-            if part.penalty.largest:
-                slacks.append(np.full(m, first))
-            else:
-                slacks.append(first + np.arange(m))
-        names += [part.name] * m
-    C = np.concatenate(on_states, axis=-2)
-    D = np.concatenate(on_inputs, axis=-2)
-    E = np.concatenate(on_moves, axis=-2)
-    slack = np.concatenate(slacks)
-    scale = row_scale(_largest_coefficients(C, D, E))
-    for first_row in np.unique(slack[slack >= 0]):
-        shared = slack == first_row
-        scale[shared] = scale[shared].min()
-    C = C * scale[:, None]
-    D = D * scale[:, None]
-    E = E * scale[:, None]
-    lower = np.concatenate(lowers, axis=1) * scale
-    upper = np.concatenate(uppers, axis=1) * scale
-    l1 = np.concatenate(linear) / scale
-    l2 = np.concatenate(quadratic) / scale**2
+    stack = _stacked(_parts(constraints, horizon, n, nu))
+    scale = _shared_scale(stack)
+    column = scale[:, None]
+    C = stack.C * column
+    D = stack.D * column
+    E = stack.E * column
+    lower = stack.lower * scale
+    upper = stack.upper * scale
+    l1 = stack.l1 / scale
+    l2 = stack.l2 / scale**2
     hard_on_inputs = np.isinf(l1) & ~_involves_states(C)
+    of_states = np.asarray(~D.any(axis=1) & ~E.any(axis=1))
     bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
     return Rows(
         scale=scale[bounded],
@@ -380,12 +378,80 @@ def stacked_rows(constraints: Sequence[Constraint], *, horizon: int, n: int, nu:
         upper=upper[:, bounded],
         l1=l1[bounded],
         l2=l2[bounded],
-        slack=renumbered(slack[bounded]),
-        of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
+        slack=renumbered(stack.slack[bounded]),
+        of_states=of_states[bounded].reshape(bounded.size),
         input=np.where(hard_on_inputs, _single_column(D, E), -1)[bounded],
         step=np.where(hard_on_inputs, _single_column(E, D), -1)[bounded],
-        names=tuple(names[i] for i in bounded),
+        names=tuple(stack.names[i] for i in bounded),
     )
+
+
+def _parts(constraints: Sequence[Constraint], horizon: int, n: int, nu: int) -> list[_Stack]:
+    """Return each constraint's rows; C is (N, m, n) for all if rows of any constraint differ from step to step."""
+    steps: tuple[int, ...] = ()
+    if any(constraint.C is not None and constraint.C.ndim == 3 for constraint in constraints):
+        steps = (horizon,)
+    parts = []
+    first_row = 0
+    for constraint in constraints:
+        m = constraint.lower.shape[-1]
+        l1, l2, slack = _softness(constraint, first_row)
+        part = _Stack(
+            C=_broadcast(constraint.C, (*steps, m, n)),
+            D=_broadcast(constraint.D, (m, nu)),
+            E=_broadcast(constraint.E, (m, nu)),
+            lower=np.broadcast_to(constraint.lower, (horizon, m)),
+            upper=np.broadcast_to(constraint.upper, (horizon, m)),
+            l1=l1,
+            l2=l2,
+            slack=slack,
+            names=[constraint.name] * m,
+        )
+        parts.append(part)
+        first_row += m
+    return parts
+
+
+def _stacked(parts: Sequence[_Stack]) -> _Stack:
+    """Return the rows of all parts, one below the other."""
+    names = []
+    for part in parts:
+        names += part.names
+    return _Stack(
+        C=np.concatenate([part.C for part in parts], axis=-2),
+        D=np.concatenate([part.D for part in parts], axis=-2),
+        E=np.concatenate([part.E for part in parts], axis=-2),
+        lower=np.concatenate([part.lower for part in parts], axis=1),
+        upper=np.concatenate([part.upper for part in parts], axis=1),
+        l1=np.concatenate([part.l1 for part in parts]),
+        l2=np.concatenate([part.l2 for part in parts]),
+        slack=np.concatenate([part.slack for part in parts]),
+        names=names,
+    )
+
+
+def _softness(part: Constraint, first_row: int) -> tuple[Array, Array, Indices]:
+    """Return l1, l2 and slacks (m,) of a constraint's rows, the first of which is number `first_row` of all.
+
+    A slack has the number of its first row.  Such numbers have gaps, which `renumbered` closes.
+    """
+    m = part.lower.shape[-1]
+    if part.penalty is None:
+        return np.full(m, math.inf), np.zeros(m), np.full(m, -1)
+    if part.penalty.largest:
+        slack = np.full(m, first_row)
+    else:
+        slack = first_row + np.arange(m)
+    return part.penalty.l1, part.penalty.l2, slack
+
+
+def _shared_scale(stack: _Stack) -> Array:
+    """Return (m,) the `row_scale` of rows; rows that share a slack have the least of theirs."""
+    scale = row_scale(_largest_coefficients(stack.C, stack.D, stack.E))
+    for number in np.unique(stack.slack[stack.slack >= 0]):
+        shared = stack.slack == number
+        scale[shared] = scale[shared].min()
+    return scale
 
 
 def _broadcast(matrix: Array | None, shape: tuple[int, ...]) -> Array:
@@ -404,7 +470,7 @@ def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
     return np.asarray(np.maximum(of_states, of_inputs))
 
 
-def _involves_states(C: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _involves_states(C: Array) -> RowFlags:
     """Return (m,) whether rows of C (m, n) or (N, m, n) involve a state."""
     if C.ndim == 3:
         return np.asarray(C.any(axis=(0, 2)))
@@ -414,4 +480,5 @@ def _involves_states(C: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
 def _single_column(matrix: Array, other: Array) -> Indices:
     """Return (m,) the only column of a row of the matrix (m, nu), where it is 1 and the other's row is 0; else -1."""
     single = (np.count_nonzero(matrix, axis=1) == 1) & (matrix.max(axis=1, initial=0.0) == 1.0)
-    return np.where(single & ~other.any(axis=1), np.argmax(matrix, axis=1), -1)
+    alone = single & ~other.any(axis=1)
+    return np.where(alone, np.argmax(matrix, axis=1), -1)

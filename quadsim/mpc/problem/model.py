@@ -49,9 +49,8 @@ class LinearModel:
     B: Array  # (n, nu) input matrix
     u_bar: Array  # (nu,) equilibrium input; the trim of a quadrotor, often omega_bar on all rotors [rad/s]
     period: float  # tau_s [s]
-    targets: bool = (
-        False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
-    )
+    # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
+    targets: bool = False
 
     @property
     def n(self) -> int:
@@ -80,26 +79,38 @@ def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0, *, moment: bool =
         A[INDEX[name], INDEX[name] + 1] = 1.0
     A[INDEX["vx"], INDEX["pitch"]] = vehicle.gravity
     A[INDEX["vy"], INDEX["roll"]] = -vehicle.gravity
-    # [U, tau_x, tau_y, tau_z] = allocation w^2, so its slope at hover is allocation diag(2 w_bar); of a thrust
-    # a_1 w + a_2 w^2 = b w_bar^2 it is a_1 + 2 a_2 w_bar = b (2 w_bar - a_1 / b).
+    # [U, tau_x, tau_y, tau_z] = allocation w^2, so its slope at hover is allocation diag(2 w_bar).  If a rotor's thrust
+    # is a_1 w + a_2 w^2, equal to b w_bar^2 at hover, its slope there is a_1 + 2 a_2 w_bar = b (2 w_bar - a_1 / b).
     linear, _ = vehicle.thrust_law
-    wrench_slope = (2.0 * vehicle.hover_speeds - linear / vehicle.coefficients) * vehicle.allocation
-    B[ACCELERATED] = vehicle.accelerations(wrench_slope)
+    speed_slopes = 2.0 * vehicle.hover_speeds - linear / vehicle.coefficients
+    B[ACCELERATED] = vehicle.accelerations(speed_slopes * vehicle.allocation)
     if moment:
         A[np.ix_(ACCELERATED, [*VELOCITY, *EULER_RATE])] += air_slopes(vehicle)
     if rotor_lag == 0.0:
         return A, B
-    follow = np.eye(N_ROTORS) / rotor_lag
-    return np.block([[A, B], [np.zeros((N_ROTORS, N_STATES)), -follow]]), np.vstack([np.zeros_like(B), follow])
+    return _with_rotor_speeds(A, B, rotor_lag)
+
+
+def _with_rotor_speeds(A: Array, B: Array, rotor_lag: float) -> tuple[Array, Array]:
+    """Add the rotor speeds w as states, dw/dt = (u - w) / T, which take the place of the inputs u in B."""
+    rate = np.eye(N_ROTORS) / rotor_lag
+    of_states = np.hstack([A, B])
+    of_rotors = np.hstack([np.zeros((N_ROTORS, N_STATES)), -rate])
+    return np.vstack([of_states, of_rotors]), np.vstack([np.zeros_like(B), rate])
 
 
 def air_slopes(vehicle: Vehicle) -> Array:
-    """(4, 6) what air adds to U / m and J^-1 tau in hover, per velocity [1/s, rad/(m s)] and rate [m/s, 1/s]."""
-    units = np.eye(3)
-    still = np.zeros(3)
-    by_velocity = [vehicle.air_accelerations(unit, still) for unit in units]
-    by_rate = [vehicle.air_accelerations(still, unit) for unit in units]
-    return np.array(by_velocity + by_rate).T
+    """(4, 6) what air adds to U / m and J^-1 tau in hover, per velocity [1/s, rad/(m s)] and rate [m/s, 1/s].
+
+    It is linear in both there, so that unit velocities and rates give the columns.
+    """
+    zero = np.zeros(3)
+    columns = []
+    for velocity in np.eye(3):
+        columns.append(vehicle.air_accelerations(velocity, zero))
+    for rates in np.eye(3):
+        columns.append(vehicle.air_accelerations(zero, rates))
+    return np.array(columns).T
 
 
 def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
@@ -132,24 +143,26 @@ def target_model(
     """The discrete model at hover above an inner loop, whose targets are the inputs.
 
     The rates follow with the time constants `lag` (thrust, p, q, r) [s], at least `SHORTEST_LAG`; the thrust at once.
-    With `attitude_lag` (roll, pitch, yaw) [s] an attitude is commanded: the inputs are then the body rates that its
-    error commands at the start of a period, and the turn since then takes from them
-    (`quadsim.mpc.problem.rigidbody`).
+    With `attitude_lag` (roll, pitch, yaw) [s] an attitude is commanded.  The inputs are then the body rates that the
+    attitude loop commands at the start of a period; as the vehicle turns, its error falls, and so do the commanded
+    rates, by the turn over `attitude_lag` (`quadsim.mpc.problem.rigidbody`).
     """
-    A, B = continuous_model(vehicle)
+    A, _ = continuous_model(vehicle)
     if attitude_lag is not None:
         A = np.pad(A, (0, 3))  # three further states: the turn since the start of the period
     B = np.zeros((len(A), N_ROTORS))
     B[INDEX["vz"], 0] = 1.0 / vehicle.mass
     for axis, (rate, tau) in enumerate(zip(EULER_RATE, lag[1:], strict=True)):
-        B[rate, 1 + axis] = 1.0 / max(tau, SHORTEST_LAG)
-        A[rate, rate] = -B[rate, 1 + axis]
+        gain = 1.0 / max(tau, SHORTEST_LAG)
+        B[rate, 1 + axis] = gain
+        A[rate, rate] = -gain
         if attitude_lag is not None:
             turn = N_STATES + axis
             A[turn, rate] = 1.0
-            A[rate, turn] = -B[rate, 1 + axis] / attitude_lag[axis]
+            A[rate, turn] = -gain / attitude_lag[axis]
     u_bar = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
     A, B = discretise(A, B, period)
+    # The turn is zero at the start of every period: the states of the next period need neither its column nor its row.
     A = np.ascontiguousarray(A[:N_STATES, :N_STATES])
     B = np.ascontiguousarray(B[:N_STATES])
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period, targets=True)
@@ -158,9 +171,11 @@ def target_model(
 def split_delay(delay: float, period: float) -> tuple[int, float]:
     """Split a delay [s] into n whole periods and the rest, which is at most a period and zero only without delay.
 
-    At t_k the commands u(k-n) .. u(k-1) are under way, and u(k-1-n) is in force for that rest.
+    At t_k the commands u(k-n) .. u(k-1) are under way, and u(k-1-n) is in force for that rest.  A delay of a whole
+    number of periods, up to rounding, has a rest of one period.
     """
-    whole = max(math.ceil(delay / period - 1e-9) - 1, 0)
+    begun_periods = math.ceil(delay / period - 1e-9)
+    whole = max(begun_periods - 1, 0)
     return whole, delay - whole * period
 
 

@@ -50,8 +50,10 @@ class CoreProblem:
         rows = self.tables.rows
         soft_rows = sum(math.isfinite(row.l1) for row in rows)
         at_most = N * (N_ROTORS + soft_rows)
-        room = min(N * len(rows), at_most) + 1
-        self.struct = self._filled(struct("quadsim_problem"), members(self.tables, room=room, changes=MOST_CHANGES))
+        capacity = min(N * len(rows), at_most) + 1
+        self.struct = self._filled(
+            struct("quadsim_problem"), members(self.tables, capacity=capacity, changes=MOST_CHANGES)
+        )
 
     def _filled(self, kind: type[Filled], values: Mapping[str, Any]) -> Filled:
         """Return a struct, and keep the memory that it points to."""

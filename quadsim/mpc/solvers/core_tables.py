@@ -53,13 +53,13 @@ class AxisTables:
     """One axis: n states, the last m of them the previous inputs if changes have a weight, and m inputs."""
 
     states: list[int]  # indices of the first n states in the problem
-    before: bool  # whether the previous inputs are states
+    has_inputs_before: bool  # whether the previous inputs are states
     inputs: int  # m
-    first: int  # index of w among the inputs of all axes
+    first_input: int  # index of w among the inputs of all axes
     rows: list[int]  # indices of the o rows on its states
     regulated: list[int]  # indices of its r rows of C_r
     B: Array  # (n, m)
-    closed: Array  # (N, n, n) A - B K_i
+    closed_loop: Array  # (N, n, n) A - B K_i
     K: Array  # (N, m, n) w_i = k_i - K_i x_i
     inverse: Array  # (N, m, m) (R + B' P_{i+1} B)^-1
     W: Array  # (n, r) linear term of a state's cost in y_d - C_r x_s
@@ -76,7 +76,7 @@ class RowTables:
     """
 
     axis: int  # -1 for a row without states
-    later: bool  # whether C x is taken at the end of the step
+    at_end: bool  # whether C x is taken at the end of the step
     terms: list[tuple[float, int, int]]  # coefficient, input, lag
     l1: float  # linear penalty; infinite for a hard row
     compliance: float  # 1 / (2 l2)
@@ -154,10 +154,10 @@ def tables(problem: Problem) -> Tables:
     )
 
 
-def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
+def members(tables: Tables, *, capacity: int, changes: int) -> dict[str, Any]:
     """Return the members of a `quadsim_problem`: integers, arrays of numbers or bytes, and lists of structs' members.
 
-    `room` is the capacity for active rows, less one; a search stops after `changes` changes of the active set.
+    At most `capacity` - 1 rows are active at a time; a search stops after `changes` changes of the active set.
     """
     problem = tables.problem
     rows = tables.rows
@@ -167,15 +167,15 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
         first = len(terms)
         for coefficient, j, lag in row.terms:
             terms.append({"coefficient": coefficient, "input": j, "lag": lag})
-        row_members.append(_row_members(row, output=_output(tables, r), first=first, past=len(terms)))
+        row_members.append(_row_members(row, output=_output(tables, r), first_term=first, end_term=len(terms)))
     return {
         "horizon": problem.horizon,
         "states": problem.model.n,
         "step_rows": len(rows),
-        "parts": len(tables.axes),
+        "axis_count": len(tables.axes),
         "regulated": len(problem.objective.C_r),
-        "speeds": rotor_states(problem),
-        "room": room,
+        "rotor_states": rotor_states(problem),
+        "capacity": capacity,
         "changes": changes,
         "bounds_differ": int(len(tables.lower) > 1),
         "mixed": int(any(row.axis >= 0 and row.terms for row in rows)),
@@ -201,15 +201,15 @@ def _output(tables: Tables, r: int) -> int:
     return tables.axes[axis].rows.index(r)
 
 
-def _row_members(row: RowTables, *, output: int, first: int, past: int) -> dict[str, Any]:
-    """Return the members of a `quadsim_row`, whose terms are those from `first` on, before `past`."""
+def _row_members(row: RowTables, *, output: int, first_term: int, end_term: int) -> dict[str, Any]:
+    """Return the members of a `quadsim_row`, whose terms are those from `first_term` on, before `end_term`."""
     soft = math.isfinite(row.l1)
     return {
         "axis": row.axis,
         "output": output,
-        "later": int(row.later),
-        "first": first,
-        "past": past,
+        "at_end": int(row.at_end),
+        "first_term": first_term,
+        "end_term": end_term,
         "soft": int(soft),
         "l1": row.l1 if soft else 0.0,
         "compliance": row.compliance,
@@ -231,15 +231,15 @@ def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
     return {
         "states": n,
         "inputs": m,
-        "first": part.first,
+        "first_input": part.first_input,
         "outputs": len(part.rows),
-        "targets": len(part.regulated),
-        "before": int(part.before),
-        "state": np.array(part.states, np.uint8),
-        "target": np.array(part.regulated, np.uint8),
-        "row": np.array(part.rows, np.uint8),
+        "regulated": len(part.regulated),
+        "has_inputs_before": int(part.has_inputs_before),
+        "state_index": np.array(part.states, np.uint8),
+        "regulated_index": np.array(part.regulated, np.uint8),
+        "row_index": np.array(part.rows, np.uint8),
         "B": _reals(part.B),
-        "closed": _reals(part.closed),
+        "closed_loop": _reals(part.closed_loop),
         "K": _reals(part.K),
         "inverse": _reals(part.inverse),
         "W": _reals(part.W),
@@ -250,7 +250,7 @@ def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
 
 
 def _require_at_most(most: int, count: int, name: str) -> None:
-    """Reject a problem with more of something than the core has room for."""
+    """Reject a problem with more of something than the core can take."""
     if count > most:
         raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
 
@@ -363,13 +363,13 @@ def _axis_tables(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
     half = scipy.linalg.solve_triangular(np.linalg.cholesky(H), channels.T, lower=True)
     return AxisTables(
         states=part.states.tolist(),
-        before=objective.Q_d is not None,
+        has_inputs_before=objective.Q_d is not None,
         inputs=m,
-        first=first,
+        first_input=first,
         rows=part.outputs.tolist(),
         regulated=part.regulated.tolist(),
         B=B,
-        closed=A - B @ K,
+        closed_loop=A - B @ K,
         K=K,
         inverse=inverse,
         W=W,
@@ -407,7 +407,7 @@ def _row_tables(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
     compliance = 0.0
     if math.isfinite(l1):
         compliance = 0.5 / max(l2, LEAST_QUADRATIC * max(l1, 1.0))
-    return RowTables(axis=axis, later=bool(rows.of_states[i]), terms=terms, l1=l1, compliance=compliance)
+    return RowTables(axis=axis, at_end=bool(rows.of_states[i]), terms=terms, l1=l1, compliance=compliance)
 
 
 def _row_scales(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
@@ -422,7 +422,7 @@ def _row_scales(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int)
                 entries.append((1.0, part.inputs + part.rows.index(r), 0))
             for coefficient, j, lag in row.terms:
                 for a in range(part.inputs):
-                    entries.append((coefficient * T[j, part.first + a], a, lag))
+                    entries.append((coefficient * T[j, part.first_input + a], a, lag))
             for left, a, lag in entries:
                 for right, b, other in entries:
                     first = max(lag, other)

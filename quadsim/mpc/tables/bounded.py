@@ -39,7 +39,7 @@ USUAL_SOLVER: Final = "piqp"
 
 @dataclass(frozen=True, kw_only=True)
 class Weighted(ControllerTable):
-    """An MPC with constant matrices, which minimises a weighted sum over a horizon."""
+    """An MPC with constant matrices, which minimises a weighted sum of squares over a horizon."""
 
     type: Law
     horizon: Annotated[Horizon, doc("[periods] N, the prediction horizon")]
@@ -68,7 +68,8 @@ class Weighted(ControllerTable):
         require_states(self.output_weights, "output_weights")
         rate_names = [STATE_NAMES[i] for i in REFERENCE_RATES]
         rates = [name for name in rate_names if name in self.output_weights]
-        if self.horizon < 2 and rates and self.desired_rates == "reference":
+        needs_differences = bool(rates) and self.desired_rates == "reference"
+        if needs_differences and self.horizon < 2:
             raise ValueError(
                 f"horizon must be at least 2 where output_weights have {', '.join(rates)}, whose desired values are "
                 f"differences of the reference; got {self.horizon}"
@@ -87,16 +88,16 @@ class Weighted(ControllerTable):
         return Problem(model=model, horizon=self.horizon, objective=objective)
 
     def objective(self) -> Objective:
-        """Return the weights, on the 12 states and without one on the last state."""
+        """Return the weights on the 12 states, without a terminal weight."""
         weights = objective_of(self.output_weights, self.input_weights.speed)
         return replace(weights, follows_rates=self.desired_rates == "reference")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bounded(Weighted):
-    """An MPC with bounds."""
+    """A weighted MPC with bounds on outputs and inputs, further rows, and a QP solver."""
 
-    holds_plans: ClassVar = False  # whether the last plan is held where a QP has no answer
+    holds_plans: ClassVar = False  # whether the last plan is flown on where the solver finds no optimum
 
     output_bounds: Annotated[
         dict[str, Pair], doc("[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c")
@@ -135,7 +136,7 @@ class Bounded(Weighted):
         return self.audited_motion() | self.input_bounds.audited(vehicle)
 
     def audited_motion(self) -> dict[str, Range]:
-        """Return its bounds on audited signals but those of the commands, in file units."""
+        """Return the audited bounds except those on commands, in file units."""
         bounds = dict(self.output_bounds)
         if self.climb_acceleration is not None:
             bounds[CLIMB] = self.climb_acceleration
@@ -151,12 +152,12 @@ class Bounded(Weighted):
         lower = np.empty(len(names))
         upper = np.empty(len(names))
         for i, name in enumerate(names):
-            scale = 1.0
+            unit = 1.0
             if name in IN_DEGREES:
-                scale = math.radians(1.0)
+                unit = math.radians(1.0)
             least, most = self.output_bounds[name]
-            lower[i] = scale * least
-            upper[i] = scale * most
+            lower[i] = unit * least
+            upper[i] = unit * most
         return selection(names), lower, upper
 
     def bounds(self) -> Bounds:
@@ -175,11 +176,12 @@ class Bounded(Weighted):
         )
 
     def constraints(self, vehicle: Vehicle) -> tuple[Constraint, ...]:
-        """Return the rows in addition to `bounds`."""
+        """Return the constraints in addition to `bounds`: on the climb acceleration of rotors, and the polytopes."""
         polytopes = rows_of(self.polytopes)
         if self.climb_acceleration is None or self.commands != ROTORS:
             return polytopes
-        return climb_of_rotors(vehicle, self.climb_acceleration), *polytopes
+        climb = climb_of_rotors(vehicle, self.climb_acceleration)
+        return climb, *polytopes
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `Weighted.problem`."""
@@ -187,14 +189,14 @@ class Bounded(Weighted):
         return replace(problem, bounds=self.bounds(), constraints=self.constraints(vehicle))
 
     def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
-        """Return the half-spaces of obstacles and regions; None without any."""
+        """Return the half-spaces that avoid obstacles and keep within regions; None without avoidance."""
         if self.avoidance is None:
             return None
         margins = self.position_margins(vehicle, period)
         return self.avoidance.space(shapes, vehicle, period=period, horizon=self.horizon, margins=margins)
 
     def position_margins(self, vehicle: Vehicle, period: float) -> Array | None:
-        """Return (N, 3) the tightening of half-spaces along x, y, z at each predicted state [m]; None for none."""
+        """Return (N, 3) by how much half-spaces are tightened along x, y, z at each predicted state [m], or None."""
         return None
 
     def make_solver(self, problem: Problem, space: Space | None) -> Solver:
@@ -205,8 +207,10 @@ class Bounded(Weighted):
         return make_solver(self.solver_name(problem, space), problem)
 
     def solver_name(self, problem: Problem, space: Space | None) -> str:
-        """Return the name of that solver: the stated one, or the usual one."""
-        return self.solver or USUAL_SOLVER
+        """Return the name of the problem's solver: the stated one, or the usual one."""
+        if self.solver is None:
+            return USUAL_SOLVER
+        return self.solver
 
 
 def require_solver(name: str) -> None:

@@ -107,7 +107,7 @@ def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> Non
     for rows in (40, 128):
         directory = quadsim.export(quadsim.load("paper-constrained", SHORT), tmp_path / str(rows), rows=rows)
         facts.append(json.loads((directory / FACTS).read_text()))
-        assert f".room = {rows + 1}," in (directory / DATA_FILE).read_text()
+        assert f".capacity = {rows + 1}," in (directory / DATA_FILE).read_text()
         assert memory_sentence(facts[-1]) in (directory / "README.md").read_text().lower()
     few, many = facts
     assert few["memory_bytes"] < many["memory_bytes"]
@@ -201,12 +201,12 @@ def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
     for i in reversed(range(N)):
         w[i] = axis.inverse[i] @ axis.B.T @ slope
         if i:
-            slope = pull[i - 1] + axis.closed[i].T @ slope
+            slope = pull[i - 1] + axis.closed_loop[i].T @ slope
     x = start
     for i in range(N):
         k = w[i].copy()
         w[i] -= axis.K[i] @ x
-        x = axis.closed[i] @ x + axis.B @ k
+        x = axis.closed_loop[i] @ x + axis.B @ k
     return w
 
 
@@ -225,7 +225,9 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
     desired = result.T_inverse @ (answer.plan[0] - problem.model.u_bar) / 1e-6
     for axis in result.axes:
         w = optimum(axis, state[axis.states], reference)
-        np.testing.assert_allclose(w[0], desired[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            w[0], desired[axis.first_input : axis.first_input + axis.inputs], rtol=1e-6, atol=1e-6
+        )
 
 
 @pytest.mark.representative("export")

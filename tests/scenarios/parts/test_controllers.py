@@ -91,7 +91,7 @@ def test_of_the_robust_controller_every_part_is_absent_unless_given() -> None:
     constrained = Assembly(scenario({**ROBUST, "type": "constrained"})).problem()
     assert same(law.problem, constrained)
     numbers = law._robust
-    assert (law.delay, numbers.heading, numbers.observes, numbers.spun_period) == (0.0, 0, 0, 0.0)
+    assert (law.delay, numbers.heading, numbers.observes, numbers.left_after_period) == (0.0, 0, 0, 0.0)
     assert numbers.largest_turn == math.radians(30.0)
 
 
@@ -105,7 +105,7 @@ BOUNDS = Bounds(
     u_max=np.full(4, 250.0),
 )
 PARTS: dict[str, tuple[Any, Callable[[RobustPreparation], object], Any]] = {
-    "rotor_lag": (0.03, lambda law: law._robust.spun_period, math.exp(-0.05 / 0.03)),
+    "rotor_lag": (0.03, lambda law: law._robust.left_after_period, math.exp(-0.05 / 0.03)),
     "delay": (0.02, lambda law: law.delay, 0.02),
     "offset_free": (
         {"force_walk": 0.7},
@@ -166,7 +166,7 @@ def test_the_vehicles_lag_is_its_rotor_rise() -> None:
     )
     vehicle = Assembly(scenario(ROBUST, "hummingbird")).vehicle
     assert vehicle.rotor_rise
-    assert preparation_of(law.law)._robust.spun_period == math.exp(-0.05 / vehicle.rotor_rise)
+    assert preparation_of(law.law)._robust.left_after_period == math.exp(-0.05 / vehicle.rotor_rise)
 
 
 # --- fallback ------------------------------------------------------------------------------------------------------

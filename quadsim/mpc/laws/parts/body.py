@@ -12,7 +12,7 @@ from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, RigidBody, inner_respo
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
-STATES_ROOM: Final = constant("QUADSIM_NMPC_MOST")
+MOST_BODY_STATES: Final = constant("QUADSIM_NMPC_MOST")
 """Most states, with the input before."""
 LEFT: Final = constant("QUADSIM_NMPC_LEFT")
 ProblemStruct: Final = struct("quadsim_nmpc_problem")

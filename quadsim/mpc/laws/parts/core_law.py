@@ -66,7 +66,7 @@ class CoreLaw:
         n = problem.model.n
         self._state = np.ctypeslib.as_array(mpc.state)[:n]
         self._rest = np.ctypeslib.as_array(mpc.rest)[:n]
-        self._resting = np.ctypeslib.as_array(mpc.resting)
+        self._resting = np.ctypeslib.as_array(mpc.rest_command)
         self._acting = np.ctypeslib.as_array(mpc.acting)
         self.start(0, problem.model.u_bar)
 

@@ -332,18 +332,18 @@ class NonlinearMPC:
         self._references = self._preview.ctypes.data, self._motion.ctypes.data
         self._command = self._acting.ctypes.data
 
-    def memory(self, room: int | None = None) -> tuple[int, int]:
-        """Return the reals and integers of memory that it needs, with room for so many active rows in its program."""
+    def memory(self, capacity: int | None = None) -> tuple[int, int]:
+        """Return the reals and integers of memory that it needs, with a capacity for active rows."""
         numbers = _NumbersStruct.from_buffer_copy(self.numbers)
         program = type(self.program.struct).from_buffer_copy(self.program.struct)
-        if room is not None:
-            program.room = room
+        if capacity is not None:
+            program.capacity = capacity
         numbers.problem = ctypes.addressof(program)
         return self._library.quadsim_nonlinear_reals(numbers), self._library.quadsim_nonlinear_ints(numbers)
 
-    def resize(self, room: int, changes: int) -> None:
-        """Make room for so many active rows, and allow so many changes of the active set, in new memory."""
-        self.program.struct.room = room
+    def resize(self, capacity: int, changes: int) -> None:
+        """Set the capacity for active rows and the limit of changes of the active set, in new memory."""
+        self.program.struct.capacity = capacity
         self.program.struct.changes = changes
         self._start()
 

@@ -69,7 +69,7 @@ class RobustPreparation:
             horizon=problem.horizon,
             states=problem.model.n,
             regulated=len(self._C_r),
-            speeds=rotor_states(problem),
+            rotor_states=rotor_states(problem),
             C_r=self._C_r.ctypes.data,
         )
         self._controller = struct("quadsim_controller")(
@@ -86,11 +86,11 @@ class RobustPreparation:
         under_way = self._robust.under_way
         self._x = np.ctypeslib.as_array(mpc.state)[:n]
         self._x_s = np.ctypeslib.as_array(mpc.rest)[:n]
-        self._u_s = np.ctypeslib.as_array(mpc.resting)
+        self._u_s = np.ctypeslib.as_array(mpc.rest_command)
         self._desired = _view(mpc.desired, N * n_r).reshape(N, n_r)
         self._sent = _view(mpc.sent, under_way * N_ROTORS).reshape(under_way, N_ROTORS)
         self._rotors = np.ctypeslib.as_array(mpc.rotors)
-        self._turning = np.ctypeslib.as_array(mpc.turning)
+        self._turning = np.ctypeslib.as_array(mpc.rotors_ahead)
         self._ahead = np.ctypeslib.as_array(mpc.ahead)
         self._estimate = np.ctypeslib.as_array(mpc.estimate)
         self._state = np.zeros(N_STATES)
@@ -120,7 +120,7 @@ class RobustPreparation:
         """See `quadsim.mpc.laws.parts.linear.Preparation`."""
         ahead = None
         estimate = None
-        if self._mpc.known:
+        if self._mpc.ahead_known:
             ahead = self._ahead.copy()
         if self._robust.observes:
             estimate = self._estimate.copy()
@@ -148,7 +148,7 @@ class RobustPreparation:
             self._measured = memory.measured
             if memory.ahead is not None and memory.delay == self.delay:
                 self._ahead[:] = memory.ahead
-                self._mpc.known = 1
+                self._mpc.ahead_known = 1
             if memory.estimate is not None:
                 disturbance = memory.estimate
         if disturbance is not None:

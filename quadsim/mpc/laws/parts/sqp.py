@@ -13,7 +13,7 @@ import numpy as np
 
 from quadsim.core.mirror import Struct, constant, set_members, struct
 from quadsim.errors import ParameterError
-from quadsim.mpc.laws.parts.body import STATES_ROOM, ProblemStruct, body_numbers
+from quadsim.mpc.laws.parts.body import MOST_BODY_STATES, ProblemStruct, body_numbers
 from quadsim.mpc.problem.constraints import Constraint
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.problem.rigidbody import P, RigidBody, V
@@ -50,7 +50,7 @@ class SQPStatus(IntEnum):
     UNCONVERGED = constant("QUADSIM_NMPC_UNCONVERGED")
     INFEASIBLE = constant("QUADSIM_NMPC_INFEASIBLE")
     GIVEN_UP = constant("QUADSIM_NMPC_GIVEN_UP")
-    NO_ROOM = constant("QUADSIM_NMPC_NO_ROOM")
+    OVER_CAPACITY = constant("QUADSIM_NMPC_OVER_CAPACITY")
     NOT_FINITE = constant("QUADSIM_NMPC_NOT_FINITE")
 
 
@@ -162,7 +162,7 @@ def nonlinear_program(
         bound_nodes=len(bounds),
         faces=faces,
         slacks=len(prices),
-        room=min(most_rows, 6 * horizon) + 1,
+        capacity=min(most_rows, 6 * horizon) + 1,
         changes=MOST_CHANGES,
         iterations=iterations,
         corrections=corrections,
@@ -171,7 +171,7 @@ def nonlinear_program(
         move=problem.objective.move_weight[0, 0],
     )
     size = model.n + N_ROTORS * moves
-    weights = np.zeros(STATES_ROOM)
+    weights = np.zeros(MOST_BODY_STATES)
     terminal = np.zeros((size, size))
     weights[: model.n] = np.diag(problem.objective.weights[0])[: model.n]
     terminal[: model.n, : model.n] = problem.objective.terminal_weights[0][: model.n, : model.n]
@@ -225,8 +225,8 @@ def multipliers(program: SQPProgram, work: Struct, rows: int, faces_from: int | 
     """
     p = program.struct
     multiplier = np.zeros((p.horizon, rows))
-    of_row = core_view(work.row, p.room, _ROW_MEMBERS, kind=ctypes.c_int)[: work.count].tolist()
-    for row, by in zip(of_row, core_view(work.multiplier, p.room).tolist(), strict=False):
+    of_row = core_view(work.row, p.capacity, _ROW_MEMBERS, kind=ctypes.c_int)[: work.count].tolist()
+    for row, by in zip(of_row, core_view(work.multiplier, p.capacity).tolist(), strict=False):
         node, kind, index, sign, _ = row
         if kind in _NAMES:
             multiplier[node, program.first[_NAMES[kind]] + index] += sign * by
