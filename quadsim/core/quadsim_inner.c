@@ -38,13 +38,13 @@ static double speed_of_thrust(const quadsim_inner *a, int i, double square)
 
 /* ---- autopilot --------------------------------------------------------------------------------------------------- */
 
-/* The parts of a torque need room: with airmode each pair's difference, else the size of each part, either way. */
+/* The thrust that parts of a torque take: with airmode the difference of each pair, else the size of each part. */
 static double torque_part(const quadsim_inner *a, const double *parts, int i, int j)
 {
     return a->airmode ? parts[i] - parts[j] : j ? -parts[i] : parts[i];
 }
 
-static double thrust_room(const quadsim_inner *a, double base, int i, int j)
+static double thrust_margin(const quadsim_inner *a, double base, int i, int j)
 {
     return a->airmode ? a->high[i] - a->low[j] : fmin(base - a->low[i], a->high[i] - base);
 }
@@ -67,7 +67,7 @@ static void mix_thrusts(const quadsim_inner *a, double thrust, const double *tor
     for (int i = 0; i < ROTORS; i++) {
         for (int j = 0; j < ROTORS; j++) {
             const double extent = torque_part(a, level, i, j);
-            share = extent > 0.0 ? fmin(share, thrust_room(a, base, i, j) / extent) : share;
+            share = extent > 0.0 ? fmin(share, thrust_margin(a, base, i, j) / extent) : share;
         }
     }
     for (int i = 0; i < ROTORS; i++) {
@@ -77,7 +77,7 @@ static void mix_thrusts(const quadsim_inner *a, double thrust, const double *tor
         for (int j = 0; j < ROTORS; j++) {
             const double change = torque_part(a, yaw, i, j);
             if (change > 1e-9 * largest) { /* rotors that turn alike differ by rounding */
-                turning = fmin(turning, (thrust_room(a, base, i, j) - torque_part(a, level, i, j)) / change);
+                turning = fmin(turning, (thrust_margin(a, base, i, j) - torque_part(a, level, i, j)) / change);
             }
         }
     }
@@ -149,14 +149,14 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
 /* Along the line on which thrust, roll and pitch torque are exact, as close as the bounds allow; false: nowhere. */
 static int reduce_yaw_torque(const quadsim_inner *a, const double *low, const double *high, double *squares)
 {
-    double room = 1.0, first = -INFINITY, last = INFINITY;
+    double slack = 1.0, first = -INFINITY, last = INFINITY;
     for (int i = 0; i < ROTORS; i++) {
-        room = fmax(room, high[i]);
+        slack = fmax(slack, high[i]);
     }
-    room *= 1e-9; /* rounding must not exclude a corner of the bounds */
+    slack *= 1e-9; /* rounding must not exclude a corner of the bounds */
     for (int i = 0; i < ROTORS; i++) {
         const double yaw = a->inverse[i][3];
-        const double one = (low[i] - room - squares[i]) / yaw, other = (high[i] + room - squares[i]) / yaw;
+        const double one = (low[i] - slack - squares[i]) / yaw, other = (high[i] + slack - squares[i]) / yaw;
         first = fmax(first, fmin(one, other));
         last = fmin(last, fmax(one, other));
     }

@@ -199,7 +199,7 @@ static void apply_estimate(quadsim_nonlinear *law)
 static void update_estimate(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
-    real expected[QUADSIM_NMPC_MOST], surprise[6];
+    real expected[QUADSIM_NMPC_MOST], innovation[6];
     int i;
     memcpy(law->last + BODY, law->rotors_before, (size_t)actuators_of(numbers) * sizeof(real));
     if (numbers->delay != NULL) {
@@ -209,9 +209,9 @@ static void update_estimate(quadsim_nonlinear *law)
     }
     for (i = 0; i < 6; i++) {
         const int at = i < 3 ? V + i : W + i - 3;
-        surprise[i] = i >= 3 && numbers->problem->targets ? R(0.0) : law->measured[at] - expected[at];
+        innovation[i] = i >= 3 && numbers->problem->targets ? R(0.0) : law->measured[at] - expected[at];
     }
-    update_disturbance(numbers->gain, numbers->largest, surprise, law->estimate);
+    update_disturbance(numbers->gain, numbers->largest, innovation, law->estimate);
     apply_estimate(law);
 }
 

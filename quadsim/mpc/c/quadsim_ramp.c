@@ -120,10 +120,11 @@ static int update_filters(quadsim_ramp *ramp, const ramp_numbers *n, const real 
         missed[2] = n->gravity * scale;
     }
     for (i = 0; i < 6; i++) {
-        const real predicted = ramp->value[i] + n->period * ramp->change[i], surprise = missed[i] - predicted;
-        const real value = predicted + n->gain[i] * surprise;
+        const real predicted = ramp->value[i] + n->period * ramp->change[i], innovation = missed[i] - predicted;
+        const real value = predicted + n->gain[i] * innovation;
         ramp->value[i] = clipped(value, -n->largest[i], n->largest[i]);
-        ramp->change[i] = is_equal(value, ramp->value[i]) ? ramp->change[i] + n->gain_of_change[i] * surprise : R(0.0);
+        ramp->change[i] =
+            is_equal(value, ramp->value[i]) ? ramp->change[i] + n->gain_of_change[i] * innovation : R(0.0);
     }
     return !holds;
 }

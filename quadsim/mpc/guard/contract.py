@@ -208,7 +208,7 @@ class Guard:
         return predict_in_heading_frame(anchored(self.model, trim), states, plans, trim)
 
     def _fit(self, horizon: int) -> None:
-        """Give plans as much room as a controller's horizon."""
+        """Give plans the length of a controller's horizon."""
         if horizon == self._struct.horizon:
             return
         if horizon < 1:

@@ -144,7 +144,7 @@ class Disturbance:
     force_deviation: Annotated[
         _Deviations, doc("[N] standard deviation of a random force that lasts, along world x, y, z")
     ] = _NONE
-    force_time: Annotated[_Times | None, doc("[s] time constants with which that force is forgotten")] = None
+    force_time: Annotated[_Times | None, doc("[s] time constants with which that force decays")] = None
     torque_deviation: Annotated[_Deviations, doc("[N m] as force_deviation, of a torque about body x, y, z")] = _NONE
     torque_time: Annotated[_Times | None, doc("[s] as force_time, for the torque")] = None
 
