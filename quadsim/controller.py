@@ -50,7 +50,7 @@ LAW: Final = "law"
 FALLBACK: Final = "fallback"
 """An earlier plan or command, or the fallback contract."""
 STOPPED: Final = "stopped"
-"""None: the rotors are off."""
+"""No source: the rotors are off."""
 NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
 """Sources of a command without an optimum, for which no active constraints and no computing time are reported."""
 NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
@@ -66,7 +66,7 @@ ATTITUDE: Final = "attitude"
 """Targets (8,): collective thrust T [N], body rates p, q, r [rad/s] that are fed forward, and the attitude to hold, a
 quaternion w, x, y, z, body to world."""
 TARGET_SIZES: Final = {ROTORS: 4, RATES: 4, ATTITUDE: 8}
-"""The number of numbers in a command."""
+"""How many numbers a command has, by what is commanded."""
 COMMANDED_NUMBERS: Final = {
     ROTORS: "four rotor speeds [rad/s]",
     RATES: "T, p, q, r: collective thrust [N] and body rates [rad/s]",
@@ -75,7 +75,7 @@ COMMANDED_NUMBERS: Final = {
         "unit quaternion from body to world"
     ),
 }
-"""These numbers in words."""
+"""The numbers of a command in words, by what is commanded."""
 LARGEST_SPEED: Final = LARGEST
 """Largest magnitude of a valid rotor speed command [rad/s], as of any number of a vehicle; a larger one is a fault."""
 

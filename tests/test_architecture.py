@@ -59,7 +59,7 @@ IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 HANDING_OUT = ("quadsim", "quadsim.mpc", "quadsim.gym")
 """Modules with a table of public names, each imported on first use; `quadsim` also starts the command."""
 DEFINED_TWICE = {"export", "fly", "load_vehicle", "main"}
-"""Public names that two modules define, as a function and its command; no name joins them."""
+"""Public names that two modules define: a function and its command, or a command line and its process (`main`)."""
 FORMULAS_TWICE = {("quadsim_nonlinear.c", "quadsim_rotation.h")}
 """C files that share a formula: the angles of a quaternion, as a controller is exported without the plant's headers."""
 

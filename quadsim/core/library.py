@@ -25,7 +25,7 @@ _compiling: Final = threading.Event()
 
 
 def is_compiling() -> bool:
-    """Return whether this process compiles the library, or waits for one that does."""
+    """Return whether this process compiles the library, or waits for one that does; for progress only."""
     return _compiling.is_set()
 
 

@@ -193,7 +193,7 @@ class ControlLog(Sampled):
     state: Array = field(metadata=columns(_STATE))  # (K, 12) measured state, as the controller received it
     reference: Array = field(metadata=columns(_REFERENCE))  # (K, 4) filtered, at t_k
     speeds: Array = field(metadata=columns(_by_rotor("u", "rad/s")))
-    """(K, 4) commanded rotor speeds in force at the end of the period."""
+    """(K, 4) commanded rotor speeds u(k), in force once their delay has passed; with an autopilot, its last answer."""
     speeds_before: Array  # (4,) u(-1), the command before the first [rad/s]
     status: tuple[str, ...] = field(metadata=columns(kind=TEXT))
     """K texts, one of `quadsim.controller.ACCEPTED` or the reason of a rejection; see `quadsim.controller.Command`."""

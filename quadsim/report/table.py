@@ -19,7 +19,7 @@ _NEGLIGIBLE: Final = {
     "deg/s": (1e-6, "0"),
     "-": (1e-9, "0"),
 }
-"""By unit: below which magnitude a number is rounding, and what is shown instead."""
+"""By unit: below which magnitude a number is rounding, and what `short_number` shows instead; others show 0."""
 
 
 class Mark(StrEnum):

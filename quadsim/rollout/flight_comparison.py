@@ -250,7 +250,7 @@ def _film(
     from quadsim.console.console import short_path
     from quadsim.report.comparison_page import write_comparison
 
-    note = f"the page without them: {short_path(comparison.page or out)}"
+    note = f"the page without them: {short_path(out)}"
     filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
     write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=True)
     if required:

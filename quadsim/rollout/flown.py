@@ -333,7 +333,7 @@ class Flight(Result):
 
     @cached_property
     def numbers(self) -> Mapping[str, Any]:
-        """`summary`, with the diagnosis as it is before the changes that it advises are flown."""
+        """`summary`; of a flight that is not saved, with the diagnosis before the changes that it advises are flown."""
         if self.recorded is None:
             return summarise(self)
         return self.recorded

@@ -261,7 +261,7 @@ def _serve(pipe: connection.Connection, pickled_fly: bytes, memory: float) -> No
     load = functools.cache(pickle.loads)
 
     def fly(flight: Any) -> Row:
-        function = load(pickled_fly)  # here, so that an error of loading becomes the row of the first flight
+        function = load(pickled_fly)  # here, so that an error of loading becomes the row of each flight
         row: Row = function(flight)
         return row
 
@@ -269,7 +269,7 @@ def _serve(pipe: connection.Connection, pickled_fly: bytes, memory: float) -> No
         pipe.send(None)  # it has started
         while True:
             flight = pipe.recv()
-            gc.freeze()  # so that the collection below looks at this flight's objects alone, and not 30 ms at all
+            gc.freeze()  # so that the collection below, up to 30 ms over all objects, is over this flight's alone
             pipe.send_bytes(_row(fly, flight, memory))
             gc.collect()  # a flight may leave a dozen megabytes in cycles
 

@@ -324,7 +324,7 @@ class Rollout:
         """The compiled controller that can fly this scenario in the core alone (`fly_in_core`).
 
         None where the flight needs Python in between: for events of controller or set-point, for code of the user, for
-        computing time, ground or obstacles, or for a controller that the core does not have.
+        computing time, ground or obstacles, for a controller at any attitude, or for one that the core does not have.
         """
         scenario = self.scenario
         controller = self.loop.controller
@@ -337,7 +337,7 @@ class Rollout:
         return controller.in_core()
 
     def fly_in_core(self, law: CoreController) -> Flight | None:
-        """Fly all periods in the core by `core_law`, audit the flight and close; call it before any other period.
+        """Fly all periods in the core by `core_law`, audit the flight and close; none of them has been flown yet.
 
         The flight lacks predictions and KKT residuals; all other numbers are those of `fly`.
 

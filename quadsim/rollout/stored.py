@@ -74,11 +74,11 @@ def read_plotted(directory: Path, before: Sequence[FlightRecord]) -> Flight:
     """Read a run to plot, as `read_flight`; `before` are the flights named before it.
 
     Raises:
-        FileError: it is no run.  A path that does not exist, behind a run, is taken for a signal: the error says how
+        FileError: it is no run.  A name that does not exist, behind a run, is taken for a signal: the error says how
             signals are named, and which there are.
         InputError: its scenario is malformed.
     """
-    if before and not directory.exists():
+    if before and not directory.exists() and len(directory.parts) == 1:
         names = ", ".join(signal_names(before))
         problem = "is not a run directory; signals are named behind --signals, as in quadsim plot RUN --signals z roll"
         raise FileError(directory, f"{problem} (there are: {names})")

@@ -488,14 +488,14 @@ class Assembly:
 
     def _with_lags(self, spec: AnyController) -> AnyController:
         """Return a controller's table with the lags of the autopilot that flies its commands, where it states none."""
+        if not is_dataclass(spec):
+            return spec
         lags = {}
         if spec.commands != ROTORS and spec.inner_lag is None:
             lags["inner_lag"] = self.inner_lag
         if spec.turns_by_attitude and spec.attitude_lag is None:
             lags["attitude_lag"] = self.attitude_lag
-        if lags and is_dataclass(spec):
-            return replace(spec, **lags)
-        return spec
+        return replace(spec, **lags)
 
     def _controllers_with_solver(self) -> tuple[AnyController, tuple[Event, ...]]:
         """Return controller and events with the `solver` of each controller stated, to fly as without.

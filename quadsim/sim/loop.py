@@ -148,8 +148,8 @@ class ClosedLoop:
             quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
             recorded: whether all periods are stored, for `log`: some 10 kB each.
         """
-        self._yaw = float(initial_state[INDEX["yaw"]])
         plant.reset(initial_state, initial_speeds)
+        self._yaw = float(initial_state[INDEX["yaw"]])
         controller.reset(initial_speeds)
         _tell_body_rates(controller, plant)
         if navigation is not None:
@@ -606,7 +606,7 @@ class _ActiveInnerLoop:
         self.inner = inner
         self.measures = takes_targets(inner)
         self._stride = stride  # physics steps between answers
-        self._has_answered = False
+        self._is_engaged = False
         self._outside = InnerStruct()  # for the core where `inner` answers in Python
         self._engage: Callable[[Array, Array], Struct | None] | None = None
         if isinstance(inner, Engaging):
@@ -620,9 +620,9 @@ class _ActiveInnerLoop:
         if struct is None:
             struct = self._outside
         struct.stride = self._stride
-        if not self._has_answered:
+        if not self._is_engaged:
             struct.until = 0  # the first answer is due at once
-            self._has_answered = True
+            self._is_engaged = True
         return struct
 
 

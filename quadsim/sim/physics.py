@@ -150,9 +150,9 @@ class Period:
     observation: Observation  # the data at its start
     command: Command  # the controller's answer, or the command passed to `step`
     speeds: Array
-    """(4,) u(k) [rad/s], the commanded rotor speeds in force at the end of the period: of `command`, of an earlier one
-    if `command` was missed, or the autopilot's last answer."""
-    target: Array | None  # (4,) or (8,) the autopilot's target in force at the end of the period; None without one
+    """(4,) u(k) [rad/s]: the rotor speeds of `command`, of an earlier one if it was missed, in force once its delay has
+    passed; with an autopilot, its last answer in the period."""
+    target: Array | None  # (4,) or (8,) what `speeds` is without an autopilot: its target; None without one
     delay: float  # simulated time from the measurement to the command [s]
     missed: bool  # whether the command came too late
     step_s: float  # wall time of the controller's step [s]; 0 if the command was passed in

@@ -48,7 +48,6 @@ def test_a_first_use_says_that_it_compiles(lines: Callable[[], list[str]], monke
     with reporting(True, "the flight"):
         monkeypatch.setattr("quadsim.console.progress.is_compiling", lambda: True)
         assert lines()[-1] == "quadsim: compiling the C library, 0 s so far"
-        monkeypatch.undo()
 
 
 def test_no_progress_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

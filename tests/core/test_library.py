@@ -140,7 +140,7 @@ def test_a_stale_library_is_replaced_and_not_overwritten(tree: Path) -> None:
 
 SLOW_COMPILER = """#!/bin/sh
 echo compiling >> "$0.calls"
-sleep "$(cat "$0.seconds")"
+while [ ! -e "$0.release" ]; do sleep 0.05; done
 exec cc "$@"
 """
 LOADING = """
@@ -154,11 +154,10 @@ print(load_from(Path(sys.argv[1])).answer())
 
 @pytest.fixture
 def slow_compiler(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A compiler that takes a second, and notes each call in `cc.calls` beside it."""
+    """A compiler that notes each call in `cc.calls` beside it, and then waits until there is `cc.release`."""
     path = tmp_path_factory.mktemp("slow") / "cc"
     path.write_text(SLOW_COMPILER)
     path.chmod(0o755)
-    path.with_suffix(".seconds").write_text("1")
     monkeypatch.setenv("CC", str(path))
     return path
 
@@ -173,6 +172,17 @@ def loading(tree: Path) -> subprocess.Popen[str]:
         text=True,
         start_new_session=True,
     )
+
+
+def release(compiler: Path) -> None:
+    """Let the compiler compile, now and from now on."""
+    compiler.with_suffix(".release").touch()
+
+
+def wait_for_the_lock(process: subprocess.Popen[str]) -> None:
+    """Return once a process has said that it waits for another one."""
+    assert process.stderr is not None
+    assert process.stderr.readline() == "waiting for another process, which compiles the C library\n"
 
 
 def calls(compiler: Path, *, at_least: int = 0) -> int:
@@ -193,24 +203,27 @@ def test_one_process_compiles_and_the_others_wait_for_it(tree: Path, slow_compil
     first = loading(tree)
     calls(slow_compiler, at_least=1)
     others = [loading(tree), loading(tree)]
+    for process in others:
+        wait_for_the_lock(process)
+    release(slow_compiler)
     answers = [process.communicate(timeout=60.0) for process in (first, *others)]
     assert [answer for answer, _ in answers] == ["1\n"] * 3
     assert calls(slow_compiler) == 1
     assert "compiling the C library" in answers[0][1]
-    for _answer, told in answers[1:]:
-        assert told == "waiting for another process, which compiles the C library\n"
+    assert [told for _, told in answers[1:]] == ["", ""], "they compile nothing"
 
 
 def test_a_process_that_dies_while_it_compiles_holds_nobody_up(tree: Path, slow_compiler: Path) -> None:
-    slow_compiler.with_suffix(".seconds").write_text("300")
     first = loading(tree)
     calls(slow_compiler, at_least=1)
-    slow_compiler.with_suffix(".seconds").write_text("0")
     second = loading(tree)
+    wait_for_the_lock(second)
     first.kill()
+    calls(slow_compiler, at_least=2)
+    os.killpg(first.pid, signal.SIGKILL)  # its compiler
+    release(slow_compiler)
     assert second.communicate(timeout=60.0)[0] == "1\n"
     assert calls(slow_compiler) == 2
-    os.killpg(first.pid, signal.SIGKILL)  # its compiler
     first.communicate()
 
 

@@ -238,10 +238,10 @@ class _Session:
             self.store.flush()
 
     def _progress(self) -> CampaignProgress:
-        completed = int(np.count_nonzero(self.outcomes >= 0))
+        flown = int(np.count_nonzero(self.outcomes >= 0))
         failed = int(np.count_nonzero(self.outcomes >= 1))
         rate = self.flown / (clock.perf_counter() - self.started)
-        return CampaignProgress(flown=completed, flights=self.needed, failed=failed, rate=rate)
+        return CampaignProgress(flown=flown, flights=self.needed, failed=failed, rate=rate)
 
     def _is_narrow_enough(self) -> bool:
         """Return whether the interval is narrow enough after the first n flights, for the smallest such n.

@@ -367,9 +367,9 @@ def compare_directories(
 
     if len(directories) != 2:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
+    check_names(names, 2)
     first = _read_finished(directories[0])
     second = _read_finished(directories[1])
-    check_names(names, 2)
     if names:
         names = (names[0], names[1])
     else:

@@ -60,7 +60,17 @@ from quadsim.report.comparison import different_audits
 from quadsim.report.comparison_page import TABLE_FILE
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.page import PAGE_FILE, Section, render_page
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, format_quantity, line, section
+from quadsim.report.table import (
+    ABSENT,
+    Cell,
+    Grid,
+    Mark,
+    format_number,
+    format_quantity,
+    line,
+    section,
+    without_rounding,
+)
 from quadsim.report.to_plotly import to_plot
 from quadsim.scenarios.schema.settings import field_text
 
@@ -132,11 +142,13 @@ class MetricComparison:
 
     @property
     def is_beyond_chance(self) -> bool:
-        """Whether the interval of the mean difference does not hold 0."""
+        """Whether the interval of the mean difference does not hold 0, nor what is only rounding."""
         difference = self.difference
         if difference.lower is None or difference.upper is None:
             return False
-        return difference.lower > 0.0 or difference.upper < 0.0
+        lower = without_rounding(difference.lower, self.unit)
+        upper = without_rounding(difference.upper, self.unit)
+        return lower > 0.0 or upper < 0.0
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

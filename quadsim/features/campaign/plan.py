@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def columns(self) -> dict[str, pa.DataType]:
-        """The columns that events may be about, with their types: not clock times, nor a flight's number and seed."""
+        """The columns that events may be about, with their types: no clock times, number, seed or `failed`."""
         others = {*TIMES, "flight", "seed", "failed"}
         return {field.name: field.type for field in self.schema if field.name not in others}
 

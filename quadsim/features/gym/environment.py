@@ -280,7 +280,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         an episode of such actions is the flight of `quadsim run`, bit for bit.
 
         Raises:
-            ParameterError: actions are thrust and rates, to which rotor speeds are not converted.
+            ParameterError: actions are targets of an autopilot, to which rotor speeds are not converted.
             FlightError: the controller has no command; a flight of `quadsim run` would end here.
             ClosedEnvironmentError: `close` has been called.
         """
@@ -303,7 +303,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """Return the action equivalent to a command; taken next, it flies that command with its plan and status.
 
         Raises:
-            ParameterError: actions are thrust and rates.
+            ParameterError: actions are targets of an autopilot.
         """
         low = self.action_space.low
         high = self.action_space.high

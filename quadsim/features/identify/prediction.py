@@ -39,9 +39,7 @@ HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at 
 RESIDUAL_AFTER: Final = 0.25  # [s] from a window's start
 JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
 RATES_JUDGED: Final = 2  # of them for body rates: later, what is not known of the torque is most of the error
-TIE: Final = (
-    0.05  # by which the errors of a quantity may exceed a baseline's, in their geometric mean over the horizons
-)
+TIE: Final = 0.05  # by which errors of a quantity may exceed a baseline's, in the geometric mean over the horizons
 NEAR_FLOOR: Final = 0.25  # by which they may exceed the floor to be said to reach it
 
 IDENTIFIED = "identified"

@@ -254,7 +254,7 @@ def _filled_by_force(
 
 
 def _at_fastest_rate(name: str, grid: Array, values: dict[str, Any]) -> tuple[Array, dict[str, Any], list[str]]:
-    """The grid, the values on it and a note: means of so many samples that they come at `FASTEST_RATE` or less."""
+    """The grid, the values on it and a note: means of an odd number of samples, at `FASTEST_RATE` or just above it."""
     period = float(grid[1] - grid[0])
     size = int(1.0 / (FASTEST_RATE * period))
     if size <= 2 or len(grid) <= 10 * size:

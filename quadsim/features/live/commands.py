@@ -49,6 +49,11 @@ def live(
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
         seed: replace the seed of everything random in the scenario.
 
+    Raises:
+        InputError: something is wrong with the scenario, the script, the port or the host.
+        OutputError: the directory cannot be written.
+        KeyboardInterrupt: it was interrupted before its first period; later, what was flown is kept.
+
     Examples:
         >>> import quadsim
         >>> quadsim.live("hover", port=70_000)

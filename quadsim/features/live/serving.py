@@ -74,7 +74,7 @@ def fly_live(
                     console.show(f"quadsim: refused: {script}: {reason}".split("\n"), console.stderr())
         except KeyboardInterrupt:
             print(file=sys.stderr)
-            if not session.k:
+            if not session.k and saving.saved is None:
                 raise KeyboardInterrupt(_nothing_flown(has_page=inputs is None)) from None
         finally:  # what was flown is saved, whatever ended it
             hold.flown = True
@@ -105,8 +105,8 @@ def _result(session: Session, saved: Flight | None, directory: Path, refused: Se
 def _nothing_flown(*, has_page: bool) -> str:
     """Return what there is of a session that was interrupted before its first period."""
     if has_page:
-        return "no page was opened, with which the flight begins: nothing was flown, and nothing is written"
-    return "nothing was flown, and nothing is written"
+        return "the flight, which begins when its page is opened, had not begun: nothing is written"
+    return "the flight had not begun: nothing is written"
 
 
 class _Saving:

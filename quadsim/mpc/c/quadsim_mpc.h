@@ -72,8 +72,9 @@ typedef struct quadsim_robust {
     quadsim_real plausible_state[12], plausible_reference[4]; /* largest magnitudes of a measurement and a reference */
 } quadsim_robust;
 
-/* A controller's numbers.  Where another solver optimises, the problem has no axes, and only quadsim_mpc_prepare may be
- * called; where quadsim guards, the fallback is NULL, and quadsim_mpc_step may not be called. */
+/* A controller's numbers.  Where another solver optimises, the problem has no axes, and neither quadsim_mpc_optimise
+ * nor quadsim_mpc_step may be called; where quadsim guards, the fallback is NULL, and quadsim_mpc_step may not be
+ * called. */
 typedef struct quadsim_controller {
     const quadsim_problem *problem;
     const quadsim_robust *robust; /* NULL: the paper's controllers */

@@ -335,6 +335,7 @@ class Nonlinear(TargetTable):
         """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q.
 
         Its vector part is half the angle between both attitudes, to first order: weights of angles count four times.
+        Where `attitude_error` is `difference`, the whole quaternion has the weight of attitude as it is.
         """
         weights = self.weights
         if self.attitude_error == "difference":

@@ -44,11 +44,13 @@ def sequence_gains(problem: Problem) -> SequenceGains:
     """Solve Eq. (21) for the optimal sequence, without the problem's constraints.
 
     Raises:
-        ParameterError: The objective has a weight Q_d on changes of the input, for which there is no gain of u(k-1).
+        ParameterError: the objective has a weight Q_d on changes of the input, for which there is no gain of u(k-1).
     """
     Q_d = problem.objective.Q_d
     if Q_d is not None and Q_d.any():
-        raise ParameterError("objective", "Q_d", Q_d.tolist(), "None or zero: this law has no gain of the input before")
+        raise ParameterError(
+            "controller", "Q_d", Q_d.tolist(), "None or zero: this law has no gain of the input before"
+        )
     terms = condensed_cost(problem, prediction(problem.model, problem.horizon))
     factor = scipy.linalg.cho_factor(terms.H)
     # The cost is quadratic in u - u_bar, so its gradient is H u - H [I; ...; I] u_bar + F_x xi(k) + F_y y_d.  In the

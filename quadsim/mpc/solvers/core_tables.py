@@ -157,7 +157,7 @@ def tables(problem: Problem) -> Tables:
 def members(tables: Tables, *, capacity: int, changes: int) -> dict[str, Any]:
     """Return the members of a `quadsim_problem`: integers, arrays of numbers or bytes, and lists of structs' members.
 
-    At most `capacity` - 1 rows are active at a time; a search stops after `changes` changes of the active set.
+    At most `capacity` rows are active at a time; a search stops after `changes` changes of the active set.
     """
     problem = tables.problem
     rows = tables.rows

@@ -14,6 +14,7 @@ from quadsim.errors import InputError, OutputError
 from quadsim.features.campaign.events import EVENT_NAMES
 from quadsim.features.campaign.paired import compare_pairs, events_figure
 from quadsim.features.campaign.statistics import estimate, holm
+from quadsim.report.table import Mark
 
 MakeCampaign = Callable[..., pa.Table]
 
@@ -121,9 +122,13 @@ def test_a_metric_that_no_pair_has_is_absent_from_the_table(thousand: pa.Table) 
 def test_a_difference_within_rounding_is_0(thousand: pa.Table) -> None:
     errors = np.array(thousand["rmse.x"].to_pylist(), float)
     moved = changed(thousand, "rmse.x", [*(errors + 3e-14)])
-    _events, metrics = compare_pairs(thousand, moved, NAMES).tables
+    compared = compare_pairs(thousand, moved, NAMES)
+    assert "closer" not in compared.tracking
+    assert "farther" not in compared.tracking
+    _events, metrics = compared.tables
     (of_x,) = [line for line in metrics.lines if line[0].text == "rmse.x [m]"]
     assert [cell.text for cell in of_x[3:5]] == ["0", "0 to 0"]
+    assert of_x[3].mark == Mark.NONE
 
 
 def test_a_campaign_and_itself_are_not_distinguishable(thousand: pa.Table) -> None:
