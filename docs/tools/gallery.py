@@ -62,7 +62,6 @@ def polyline(points: Array, looks: str) -> str:
 
 def take(name: str, fps: int) -> tuple[Filmed, str, Shot]:
     """A scenario's flight, the title of its film, and its pictures, so many a second."""
-    film.start()
     import quadsim
 
     run = filmed(quadsim.fly(name, progress=False))
@@ -113,6 +112,7 @@ def main() -> None:
     for name, text in texts().items():
         (FILES / f"{name}.txt").write_text(text, encoding="utf-8")  # as text, which a browser shows
     try:
+        film.start()  # here, as every flight imports MuJoCo
         with ProcessPoolExecutor(usable_cores()) as pool, reporting(True, "the films") as report:
             films = sys.argv[1:] == ["films"]
             stages = {film_flight: NAMES} if films else {thumbnail: scenario_names(), poster: NAMES}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -158,7 +159,7 @@ def slow_compiler(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.
     path = tmp_path_factory.mktemp("slow") / "cc"
     path.write_text(SLOW_COMPILER)
     path.chmod(0o755)
-    monkeypatch.setenv("CC", str(path))
+    monkeypatch.setenv("CC", shlex.quote(str(path)))
     return path
 
 
