@@ -362,6 +362,26 @@ def identification(data: Any) -> str:
     return f"A constraint is violated in {'; in '.join(by)}.\n"
 
 
+def intervals(data: Any) -> str:
+    """How many intervals that pass the gates hold the true value, in all logs and in the kind with the lowest share."""
+    passed: dict[str, int] = {}
+    inside: dict[str, int] = {}
+    logs: dict[str, int] = {}
+    for row in records(data):
+        kind = row["condition"]
+        passed[kind] = passed.get(kind, 0) + row["passed"]
+        inside[kind] = inside.get(kind, 0) + row["inside"]
+        logs[kind] = row["logs"]
+    worst = min(passed, key=lambda kind: inside[kind] / passed[kind])
+    every = sum(passed.values())
+    holding = sum(inside.values())
+    return (
+        f"In {sum(logs.values())} logs {holding} of the {every} intervals that pass the gates hold the true value: "
+        f"{100.0 * holding / every:.1f} %, where 95 % are promised. The lowest share is {inside[worst]} of "
+        f"{passed[worst]}, in the logs of kind *{worst}*.\n"
+    )
+
+
 def stability(data: Any) -> str:
     """Up to where each law is stable on each vehicle."""
     rows = records(data)
@@ -441,7 +461,8 @@ CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
 """What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
-    **{each.__name__: each for each in (flight, batch, campaign, film, identification, autopilots, stability, moment)},
+    **{each.__name__: each for each in (flight, batch, campaign, film, identification, intervals)},
+    **{each.__name__: each for each in (autopilots, stability, moment)},
     "mismatch": mismatch,
     "ppo": ppo,
     "paper": both_flights,
