@@ -9,8 +9,9 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import fields
 from functools import partial
-from typing import Any, Final, get_type_hints
+from typing import Any, Final
 
 from timing import Record, options, run
 
@@ -39,7 +40,10 @@ def with_law(scenario: Scenario, law: str) -> Scenario:
     own: Mapping[str, Any] = scenario.tables["controller"]
     if law == scenario.controller.type:
         return scenario
-    names = {*get_type_hints(TABLES[law])} if issubclass(TABLES[law], Weighted) else set()
+    table = TABLES[law]
+    names: set[str] = set()
+    if issubclass(table, Weighted):
+        names = {field.name for field in fields(table)}
     kept = {name: value for name, value in own.items() if name in names}
     turning = {"heading": True} if law == "robust" else {}  # the switch by which it differs here from constrained
     return scenario.replace({"controller": kept | turning | {"type": law}})
@@ -85,8 +89,10 @@ def measure(quick: bool, progress: Progress) -> list[Record]:
     progress("loops", 0, len(cases))
     with closing(fly_many(cases, margins_of, timeout=3600.0)) as rows:
         for done, (place, row) in enumerate(rows, start=1):
-            records[place] = row
             progress("loops", done, len(cases))
+            if "verdict" in row:
+                raise QuadsimError(f"{', '.join(cases[place])}: {row['verdict']} ({row['reason']})")
+            records[place] = row
     return records
 
 

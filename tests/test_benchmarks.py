@@ -169,6 +169,18 @@ def test_the_margins_of_lqr_are_on_both_sides(tmp_path: Path) -> None:
     assert 50.0 < float(record["delay [ms]"]) < 100.0
 
 
+def test_each_law_takes_what_it_has_of_each_vehicle_s_scenario() -> None:
+    code = (
+        "import sys; sys.path[:0] = ['benchmarks']; import quadsim; from stability import LAWS, SCENARIOS, with_law; "
+        "scenarios = [quadsim.load(name) for name in SCENARIOS.values()]; "
+        "print([with_law(each, law).controller.type == law for each in scenarios for law in LAWS])"
+    )
+    done = script("-c", code)
+    assert done.returncode == 0, done.stderr
+    assert "True" in done.stdout
+    assert "False" not in done.stdout
+
+
 def test_wrong_input_is_one_message(tmp_path: Path) -> None:
     done = script("benchmarks/solvers.py", "--scenario", "hover-pid", "--json", tmp_path / "out.json")
     assert done.returncode == 2
