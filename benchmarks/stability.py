@@ -9,7 +9,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -20,7 +20,6 @@ from quadsim.console.progress import Progress
 from quadsim.errors import QuadsimError
 from quadsim.features.stability.margins import LoopMargins, MeasuredLoop, loop_margins
 from quadsim.features.stability.quantities import VARIED
-from quadsim.mpc.tables.bounded import Weighted
 from quadsim.rollout.growth import SIZE
 from quadsim.rollout.many import fly_many
 from quadsim.scenarios.schema.controllers import LAWS, TABLES
@@ -41,10 +40,11 @@ def with_law(scenario: Scenario, law: str) -> Scenario:
     if law == scenario.controller.type:
         return scenario
     table = TABLES[law]
-    names: set[str] = set()
-    if issubclass(table, Weighted):
-        names = {field.name for field in fields(table)}
-    kept = {name: value for name, value in own.items() if name in names}
+    assert is_dataclass(table)
+    names = {field.name for field in fields(table)}
+    kept: dict[str, Any] = {}
+    if "output_weights" in names:
+        kept = {name: value for name, value in own.items() if name in names}
     turning = {"heading": True} if law == "robust" else {}  # the switch by which it differs here from constrained
     return scenario.replace({"controller": kept | turning | {"type": law}})
 
